@@ -1,0 +1,79 @@
+"""The one function type of everything that moves a vehicle.
+
+A kinematic baseline, the built-in simulator, a learned specialist, the fused model: each is a
+frozen, hashable object with two pure functions of one vehicle. Batches are made by `vmap`,
+trajectories by `lax.scan`; weights, maps and state are arguments.
+"""
+
+from typing import Any, Protocol
+
+import jax
+
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain.map import TerrainMap
+
+Params = Any
+History = Any
+
+
+class Dynamics(Protocol):
+    """Moves one vehicle by 0.1 s over a terrain map.
+
+    `init` starts the history of a vehicle that stands or drives at `state`; `step` holds
+    `command` for one step and gives the next state with the history that goes with it. What a
+    model perceives of the ground at a state is part of the history it returns with that state,
+    so a policy can read it without computing it again.
+    """
+
+    def init(self, params: Params, terrain: TerrainMap, state: VehicleState) -> History: ...
+
+    def step(
+        self,
+        params: Params,
+        terrain: TerrainMap,
+        history: History,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, History]: ...
+
+
+def warm_up(
+    dynamics: Dynamics,
+    params: Params,
+    terrain: TerrainMap,
+    states: VehicleState,
+    commands: Command,
+) -> History:
+    """The history after a recorded context: `states` leaves `[C + 1, 3]`, `commands` `[C]`.
+
+    Each step starts from the recorded state, so that only what the state does not say (wheel
+    speeds, steering angle, past tokens) is carried along.
+    """
+    first = jax.tree.map(lambda x: x[0], states)
+    before = jax.tree.map(lambda x: x[:-1], states)
+
+    def advance(history: History, inputs: tuple[VehicleState, Command]) -> tuple[History, None]:
+        _, history = dynamics.step(params, terrain, history, *inputs)
+        return history, None
+
+    history, _ = jax.lax.scan(advance, dynamics.init(params, terrain, first), (before, commands))
+    return history
+
+
+def rollout(
+    dynamics: Dynamics,
+    params: Params,
+    terrain: TerrainMap,
+    history: History,
+    state: VehicleState,
+    commands: Command,
+) -> VehicleState:
+    """Open-loop prediction: `commands` leaves `[T]` to the T states that follow, leaves `[T, 3]`."""
+
+    def advance(
+        carry: tuple[VehicleState, History], command: Command
+    ) -> tuple[tuple[VehicleState, History], VehicleState]:
+        state, history = dynamics.step(params, terrain, carry[1], carry[0], command)
+        return (state, history), state
+
+    return jax.lax.scan(advance, (state, history), commands)[1]
