@@ -68,7 +68,7 @@ def rollout(
     state: VehicleState,
     commands: Command,
 ) -> VehicleState:
-    """Open-loop prediction: `commands` leaves `[T]` to the T states that follow, leaves `[T, 3]`."""
+    """Open-loop prediction: `commands` leaves `[T]` to the next T states, leaves `[T, 3]`."""
 
     def advance(
         carry: tuple[VehicleState, History], command: Command

@@ -1,12 +1,37 @@
 """The terrain map: what the ground is, everywhere, for one world or many stacked ones."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Self
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
+from numpy.typing import ArrayLike
 
+from vertiwm_jax.terrain import soil
+from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.soil import Soil
+
+ELEVATION_RANGE = (0.0, 16.0)
+"""Metres mapped to [-1, 1] in elevation patches, one constant for all ground.
+
+Verti-Bench's scale (its highest maximum height is 16 m), which holds its worlds, the recorded
+Chrono drives and the procedural worlds, so that one encoder sees one scale everywhere.
+"""
+
+
+# What stacked worlds have in common.
+_SHARED = ("origin", "resolution", "elevation_range", "class_rgb", "deformable", "soils")
+
+
+class MapError(ValueError):
+    """A map that cannot be used; the message names the file, the field and the mend."""
+
+    def __init__(self, name: str, field: str, expected: str, found: str, mend: str = "") -> None:
+        ending = f"; {mend}" if mend else ""
+        super().__init__(f"{name}: {field}: expected {expected}, found {found}{ending}")
 
 
 @struct.dataclass
@@ -51,4 +76,208 @@ class TerrainMap:
 
     def select(self, world: jax.Array) -> Self:
         """The map with world `[]` selected. Under `vmap` only the index is batched: no copy."""
-        return self.replace(world=jnp.asarray(world, jnp.int32))
+        return replace(self, world=jnp.asarray(world, jnp.int32))
+
+
+def build(
+    elevation: ArrayLike,
+    semantic: ArrayLike,
+    friction: ArrayLike | None = None,
+    obstacles: ArrayLike | None = None,
+    *,
+    resolution: float = 1.0,
+    origin: tuple[float, float] | None = None,
+    elevation_range: tuple[float, float] = ELEVATION_RANGE,
+    classes: GroundClasses = STANDARD,
+    name: str = "map",
+) -> TerrainMap:
+    """A checked map of one world, from arrays.
+
+    elevation `[R, C]` m, semantic `[r, c]` class ids, friction `[r, c]` (the mean of each class
+    when left out; values on soil are ignored), obstacles `[N, 5]`, resolution m, origin x, y of
+    vertex (0, 0) m (the map is centred when left out). Raises `MapError`, which calls it `name`.
+    """
+    elevation, semantic = np.asarray(elevation, np.float32), np.asarray(semantic)
+    for field, array in (("elevation", elevation), ("semantic", semantic)):
+        if array.ndim != 2:
+            raise MapError(name, field, "a 2-D array", f"shape {array.shape}")
+    _check_ids(semantic, classes.names, name)
+    if friction is None:
+        friction = classes.friction[semantic]
+    friction = np.asarray(friction, np.float32)
+    if friction.shape == semantic.shape:
+        friction = np.where(classes.deformable[semantic], 0, friction)
+    if origin is None:
+        rows, columns = elevation.shape
+        origin = (-(columns - 1) / 2 * resolution, (rows - 1) / 2 * resolution)
+    obstacles = np.zeros((0, 5)) if obstacles is None else np.asarray(obstacles)
+    terrain = TerrainMap(
+        elevation=jnp.asarray(elevation[None]),
+        semantic=jnp.asarray(semantic[None], jnp.uint8),
+        friction=jnp.asarray(friction[None], jnp.float32),
+        obstacles=jnp.asarray(obstacles[None], jnp.float32),
+        origin=jnp.asarray(origin, jnp.float32),
+        resolution=jnp.float32(resolution),
+        elevation_range=jnp.asarray(elevation_range, jnp.float32),
+        class_rgb=jnp.asarray(classes.rgb, jnp.uint8),
+        deformable=jnp.asarray(classes.deformable),
+        soils=classes.stacked_soils(),
+        world=jnp.int32(0),
+        class_names=classes.names,
+    )
+    return validate(terrain, name)
+
+
+def stack(maps: Sequence[TerrainMap], names: Sequence[str] | None = None) -> TerrainMap:
+    """Concatenates worlds of maps of equal extent, classes and scale; world 0 is selected.
+
+    Obstacle lists are padded to the longest. Raises `MapError` naming the first map that
+    differs (by `names`, or its place) and the field.
+    """
+    if not maps:
+        raise MapError("stack", "maps", "at least one map", "none")
+    names = names or [f"map {i}" for i in range(len(maps))]
+    first = maps[0]
+    for terrain, name in zip(maps[1:], names[1:], strict=True):
+        for field in ("elevation", "semantic"):
+            ours, theirs = (getattr(m, field).shape[1:] for m in (first, terrain))
+            if ours != theirs:
+                expected = f"shape {ours} as in {names[0]}"
+                raise MapError(name, field, expected, f"{theirs}", "crop or resample it")
+        ours, theirs = first.class_names, terrain.class_names
+        if ours != theirs:
+            raise MapError(name, "class_names", f"{ours} as in {names[0]}", f"{theirs}")
+        for field in _SHARED:
+            ours, theirs = (jax.tree.leaves(getattr(m, field)) for m in (first, terrain))
+            if not all(np.allclose(a, b) for a, b in zip(ours, theirs, strict=True)):
+                ours, theirs = (np.array_str(np.asarray(x).squeeze()) for x in (ours, theirs))
+                raise MapError(name, field, f"{ours} as in {names[0]}", theirs)
+    longest = max(m.obstacles.shape[1] for m in maps)
+
+    def padded(terrain: TerrainMap) -> jax.Array:
+        missing = longest - terrain.obstacles.shape[1]
+        return jnp.pad(terrain.obstacles, ((0, 0), (0, missing), (0, 0)))
+
+    return replace(
+        first,
+        elevation=jnp.concatenate([m.elevation for m in maps]),
+        semantic=jnp.concatenate([m.semantic for m in maps]),
+        friction=jnp.concatenate([m.friction for m in maps]),
+        obstacles=jnp.concatenate([padded(m) for m in maps]),
+        world=jnp.int32(0),
+    )
+
+
+def validate(terrain: TerrainMap, name: str = "map") -> TerrainMap:
+    """The same map if it can be used; `MapError` names `name`, the field and the place.
+
+    For concrete maps at the border (files, user arrays), not inside jit.
+    """
+    worlds, classes = terrain.elevation.shape[0], len(terrain.class_names)
+    _check_shapes(terrain, worlds, classes, name)
+    resolution, origin, span = (
+        np.asarray(x) for x in (terrain.resolution, terrain.origin, terrain.elevation_range)
+    )
+    if not (np.isfinite(resolution) and resolution > 0):
+        raise MapError(name, "resolution", "metres between vertices, > 0", f"{resolution}")
+    if not np.isfinite(origin).all():
+        raise MapError(name, "origin", "finite x, y", f"{origin}")
+    if not (np.isfinite(span).all() and span[0] < span[1]):
+        raise MapError(name, "elevation_range", "lowest < highest, m", f"{span}")
+    if not 0 <= int(terrain.world) < worlds:
+        raise MapError(name, "world", f"0 to {worlds - 1}", f"{int(terrain.world)}")
+
+    elevation = np.asarray(terrain.elevation)
+    _check(np.isfinite(elevation), elevation, name, "elevation", "finite heights", "fill the holes")
+    inside = (elevation >= span[0]) & (elevation <= span[1])
+    expected = f"heights within elevation_range [{span[0]:g}, {span[1]:g}] m"
+    _check(inside, elevation, name, "elevation", expected, "pass a wider elevation_range")
+
+    semantic, friction = np.asarray(terrain.semantic), np.asarray(terrain.friction)
+    _check_ids(semantic, terrain.class_names, name)
+    rows, columns = (n - 1 for n in elevation.shape[1:])
+    aspect = (rows / semantic.shape[1]) / (columns / semantic.shape[2])
+    if not 0.9 < aspect < 1.1:
+        raise MapError(
+            name, "semantic", f"square cells over {rows} x {columns} vertex cells",
+            f"{semantic.shape[1]} x {semantic.shape[2]} cells, {aspect:.2f} times as tall as wide",
+            "resample the class raster to the extent of the heights",
+        )  # fmt: skip
+    soft = np.asarray(terrain.deformable)[semantic]
+    _check(np.isfinite(friction) & (friction >= 0), friction, name, "friction", "numbers >= 0")
+    _check(soft | (friction > 0), friction, name, "friction", "> 0 on rigid ground")
+    _check(~soft | (friction == 0), friction, name, "friction", "0 on soil")
+    try:
+        soil.validate(terrain.soils, f"{name}: soils")
+    except ValueError as error:
+        raise MapError(name, "soils", "soils in SI units", str(error)) from None
+    _check_obstacles(terrain, name)
+    return terrain
+
+
+def _check(
+    good: np.ndarray, values: np.ndarray, name: str, field: str, expected: str, mend: str = ""
+) -> None:
+    """Raises with the first of the values that are not good, where it is and how many there are."""
+    bad = np.argwhere(~good)
+    if len(bad):
+        world, row, column = bad[0]
+        where = f"{values[world, row, column]} at world {world}, row {row}, column {column}"
+        raise MapError(name, field, expected, f"{where} ({len(bad)} such)", mend)
+
+
+def _check_ids(semantic: np.ndarray, class_names: tuple[str, ...], name: str) -> None:
+    if not np.issubdtype(semantic.dtype, np.integer):
+        raise MapError(name, "semantic", "integer class ids", f"dtype {semantic.dtype}")
+    last = len(class_names) - 1
+    stacked = semantic if semantic.ndim == 3 else semantic[None]
+    expected = f"class ids 0 to {last} ({', '.join(class_names)})"
+    _check((stacked >= 0) & (stacked <= last), stacked, name, "semantic", expected)
+
+
+def _check_shapes(terrain: TerrainMap, worlds: int, classes: int, name: str) -> None:
+    expected: dict[str, tuple[int | None, ...]] = {
+        "elevation": (worlds, None, None),
+        "semantic": (worlds, None, None),
+        "friction": terrain.semantic.shape,
+        "obstacles": (worlds, None, 5),
+        "origin": (2,),
+        "resolution": (),
+        "elevation_range": (2,),
+        "class_rgb": (classes, 3),
+        "deformable": (classes,),
+        "world": (),
+    }
+    leaves = {field: getattr(terrain, field) for field in expected}
+    for field, value in vars(terrain.soils).items():
+        expected[f"soils.{field}"], leaves[f"soils.{field}"] = (classes,), value
+    for field, shape in expected.items():
+        found = jnp.shape(leaves[field])
+        agrees = len(found) == len(shape) and all(
+            n in (None, m) for n, m in zip(shape, found, strict=True)
+        )
+        if not agrees:
+            wanted = ", ".join("any" if n is None else str(n) for n in shape)
+            mend = f"there are {worlds} worlds and {classes} classes"
+            raise MapError(name, field, f"shape ({wanted})", f"{found}", mend)
+    if min(terrain.elevation.shape[1:]) < 2 or min(terrain.semantic.shape[1:]) < 1:
+        found = f"{terrain.elevation.shape[1:]} and {terrain.semantic.shape[1:]}"
+        raise MapError(name, "elevation", "2 x 2 vertices and 1 cell or more", found)
+
+
+def _check_obstacles(terrain: TerrainMap, name: str) -> None:
+    obstacles = np.asarray(terrain.obstacles)
+    columns = ("x", "y", "size x", "size y", "height")
+    expected = "finite numbers in columns " + ", ".join(columns)
+    _check(np.isfinite(obstacles), obstacles, name, "obstacles", expected)
+    sizes = np.broadcast_to(obstacles[..., 2:].min(-1, keepdims=True), obstacles.shape)
+    _check(sizes >= 0, obstacles, name, "obstacles", "sizes and heights >= 0")
+    rows, columns_ = terrain.elevation.shape[1:]
+    extent = np.array([columns_ - 1, rows - 1]) * float(terrain.resolution)
+    left_top = np.asarray(terrain.origin)
+    low, high = left_top - [0, extent[1]], left_top + [extent[0], 0]
+    centre = obstacles[..., :2]
+    unused = (obstacles == 0).all(-1, keepdims=True)
+    inside = unused | ((centre >= low) & (centre <= high))
+    expected = f"centres within x {low[0]:g} to {high[0]:g}, y {low[1]:g} to {high[1]:g}"
+    _check(inside, centre, name, "obstacles", expected)

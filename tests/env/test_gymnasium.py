@@ -1,0 +1,91 @@
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from env.worlds import bicycle_env, ground, hills, task
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+from vertiwm_jax.env.gymnasium import NavigationGymEnv, NavigationVectorEnv
+from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.tasks import circle_tasks
+from vertiwm_jax.env.termination import Ending
+
+
+@pytest.fixture(scope="module")
+def short():
+    """Episodes of 3 steps."""
+    terrain = ground(hills(), [[9.0, 3.0, 4.0, 6.0, 2.0]])
+    config = NavigationConfig(horizon_seconds=0.3)
+    return bicycle_env(terrain, circle_tasks(terrain), config)
+
+
+@pytest.mark.filterwarnings("error", "ignore:.*not having a spec")
+def test_single_passes_gymnasium_s_own_check(short):
+    check_env(NavigationGymEnv(*short, render_mode="rgb_array"))
+
+
+def test_single_ends_by_truncation_and_shows_the_world(short):
+    env = NavigationGymEnv(*short, render_mode="rgb_array")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(env.action_space.sample())
+    env.reset(seed=3)
+    ends = [env.step(np.array([1.0, 0.0], np.float32))[2:] for _ in range(3)]
+    assert [end[:2] for end in ends] == [(False, False), (False, False), (False, True)]
+    assert ends[-1][2]["ending"] == Ending.TIMED_OUT
+    picture = env.render()
+    assert picture.shape == (512, 512, 3) and picture.dtype == np.uint8
+    red = (picture == np.round(255 * np.array([0.8, 0.05, 0.05]))).all(-1)
+    # 4.6 m x 2.2 m, less the white nose, at 16 pixels a square metre.
+    assert red.sum() == pytest.approx(0.75 * 4.6 * 2.2 * 16, rel=0.15)
+
+
+def test_single_knows_its_render_modes(short):
+    with pytest.raises(ValueError, match="render_mode: expected None or"):
+        NavigationGymEnv(*short, render_mode="human")
+
+
+def test_the_vehicle_is_drawn_where_it_is():
+    env = NavigationGymEnv(*bicycle_env(ground(), task((40, 20), (0, 0))), render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render().astype(int)
+    rows, columns = np.nonzero(picture[..., 0] - picture[..., 1] > 150)
+    assert columns.mean() / 4 - 64 == pytest.approx(40, abs=1)
+    assert 64 - rows.mean() / 4 == pytest.approx(20, abs=1)
+
+
+def test_vector_resets_in_the_step_that_ends(short):
+    env = NavigationVectorEnv(*short, num_envs=4)
+    assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    first, info = env.reset(seed=5)
+    again, _ = env.reset(seed=5)
+    np.testing.assert_array_equal(first, again)
+    assert first in env.observation_space and info == {}
+    actions = np.tile(np.array([1.0, 0.0], np.float32), (4, 1))
+    assert actions in env.action_space
+    for _ in range(2):
+        _, _, terminated, truncated, info = env.step(actions)
+        assert not (terminated | truncated).any() and "final_obs" not in info
+        assert info["_distance"].all()
+    observation, reward, terminated, truncated, info = env.step(actions)
+    assert not terminated.any() and truncated.all() and reward.shape == (4,)
+    assert observation in env.observation_space
+    assert info["_final_obs"].all() and not info["_ending"].any()
+    assert (info["final_info"]["ending"] == Ending.TIMED_OUT).all()
+    starts = np.asarray(short[1].start_observation)
+    for now, final in zip(observation, info["final_obs"], strict=True):
+        assert (now == starts).all(-1).any() and not (final == starts).all(-1).any()
+
+
+def test_vector_agrees_with_single(short):
+    env, params = short
+    vector = NavigationVectorEnv(env, params, num_envs=2)
+    vector.reset(seed=0)
+    states, step = vector._state, jax.jit(env.step_env)
+    action = np.array([[0.3, -0.6], [1.0, 0.2]], np.float32)
+    observation, reward, *_ = vector.step(action)
+    for i in range(2):
+        state = jax.tree.map(lambda x, i=i: x[i], states)
+        expected = step(jax.random.key(0), state, action[i], params)
+        np.testing.assert_allclose(observation[i], expected[0], atol=1e-5)
+        np.testing.assert_allclose(reward[i], expected[2], rtol=1e-4)

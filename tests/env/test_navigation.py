@@ -1,0 +1,183 @@
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from env.worlds import BICYCLE, Scripted, bicycle_env, ground, hills, task
+
+from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
+from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.env.tasks import circle_tasks
+from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.mechanics.kinematic import KinematicBicycle
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain import map as terrain_map
+
+KEY = jax.random.key(0)
+AHEAD = jnp.array([1.0, 0.0])
+
+
+def drive(x, y=0.0, z=0.47, roll=0.0, speed=4.0):
+    """States of a script, leaves `[T, 3]`, from whichever arguments are sequences."""
+    x, y, z, roll, speed = np.broadcast_arrays(*map(np.atleast_1d, (x, y, z, roll, speed)))
+    zero = np.zeros_like(x, np.float32)
+    return VehicleState(
+        *(
+            jnp.asarray(np.stack(columns, axis=-1), jnp.float32)
+            for columns in ((x, y, z), (roll, zero, zero), (speed, zero, zero), (zero,) * 3)
+        )
+    )
+
+
+def play(script, steps, terrain=None, goal=(30.0, 0.0), **settings):
+    """Outputs of `steps` steps of a script that starts at (0, 0)."""
+    config = NavigationConfig(**settings)
+    env = NavigationEnv(Scripted(config.settle_steps), config)
+    params = env.make_params(script, terrain or ground(), task((0.0, 0.0), goal))
+    step = jax.jit(env.step_env)
+    _, state = env.start(params, 0)
+    outputs = []
+    for _ in range(steps):
+        observation, state, reward, terminated, info = step(KEY, state, AHEAD, params)
+        truncated = env.is_truncated(state, params)
+        outputs.append((observation, state, reward, bool(terminated), bool(truncated), info))
+    return outputs
+
+
+def endings(outputs):
+    return [Ending(int(info["ending"])).name for *_, info in outputs]
+
+
+@pytest.mark.parametrize(
+    ("script", "ending"),
+    [
+        (drive([10.0, 22.5]), "GOAL"),
+        (drive([10.0, 20.0], y=[0.0, 63.5]), "OFF_MAP"),
+        (drive([1.0, 2.0], roll=[0.5, -1.1]), "ROLLED_OVER"),
+        (drive([1.0, 6.0]), "COLLIDED"),
+        (drive([1.0, np.nan]), "DIVERGED"),
+        (drive([1.0, 2.0], speed=[4.0, np.inf]), "DIVERGED"),
+        (drive([1.0, 2.0], speed=[4.0, 40.0]), "DIVERGED"),
+        (drive([1.0, 2.0], z=[0.5, 9.0]), "DIVERGED"),
+    ],
+)
+def test_every_fault_ends_the_task(script, ending):
+    obstacle = ground(obstacles=[[9.0, 0.0, 2.0, 2.0, 1.0]])
+    terrain = obstacle if ending == "COLLIDED" else None
+    outputs = play(script, 2, terrain)
+    assert endings(outputs) == ["RUNNING", ending]
+    assert [(o[3], o[4]) for o in outputs] == [(False, False), (True, False)]
+
+
+def test_a_diverged_state_never_leaves():
+    (_, before, *_), (observation, after, reward, *_) = play(drive([1.0, np.nan]), 2)
+    assert jnp.isfinite(observation).all() and jnp.isfinite(reward)
+    chex.assert_trees_all_equal(after.vehicle, before.vehicle)
+    assert after.history == before.history
+
+
+def test_standing_is_stuck_only_without_a_break():
+    speed = np.full(40, 0.1)
+    speed[9] = 1.0
+    outputs = play(drive(1.0, speed=speed), 20, stuck_seconds=1.0)
+    assert endings(outputs).index("STUCK") == 19
+    assert outputs[19][3] and not outputs[19][4]
+
+
+def test_time_out_truncates_and_a_goal_at_the_last_step_terminates():
+    far = play(drive(1.0), 3, horizon_seconds=0.3)
+    assert [(o[3], o[4]) for o in far] == [(False, False)] * 2 + [(False, True)]
+    assert endings(far)[-1] == "TIMED_OUT"
+    # 29 m are left, and the settled start is level with the goal but for the axle height.
+    distance = np.hypot(29.0, 0.47)
+    np.testing.assert_allclose(far[-1][2], -100 - 10 * distance, rtol=1e-5)
+    there = play(drive([1.0, 2.0, 25.0]), 3, horizon_seconds=0.3)
+    assert (there[-1][3], there[-1][4]) == (True, False)
+
+
+def test_reward_of_a_step_is_that_computed_by_hand():
+    (first, second) = play(drive([1.0, 1.5], z=[0.47, 0.52], roll=[0.0, 0.6]), 2)
+    before, after = np.hypot(29.0, 0.47), np.hypot(28.5, 0.52)
+    tilt = 20 * (0.6 / np.radians(30)) * (0.6 - np.radians(30))
+    np.testing.assert_allclose(second[2], 50 * (before - after) - tilt - 0.5, rtol=1e-4)
+    np.testing.assert_allclose(first[5]["distance"], before, rtol=1e-6)
+    np.testing.assert_allclose(second[5]["abs_roll"], 0.6, rtol=1e-6)
+
+
+def test_actions_are_commands_and_back():
+    config = NavigationConfig(speed_range=(-1.0, 5.0), steering_limit=0.4)
+    command = config.command(jnp.array([[-1.0, 0.5], [1.0, -3.0], [0.0, 0.0]]))
+    np.testing.assert_allclose(command.speed, [-1, 5, 2], rtol=1e-6)
+    np.testing.assert_allclose(command.steering, [0.2, -0.4, 0], rtol=1e-6)
+    action = config.action(Command(jnp.float32(3.5), jnp.float32(-0.1)))
+    np.testing.assert_allclose(action, [0.5, -0.25], rtol=1e-6)
+    np.testing.assert_allclose(config.action(Command(jnp.float32(9), jnp.float32(0))), [1, 0])
+
+
+def test_starts_stand_on_the_ground_and_resets_draw_all_of_them():
+    terrain = terrain_map.stack([ground(hills()), ground()])
+    env, params = bicycle_env(terrain, circle_tasks(terrain, radius=50.0, pairs=4))
+    assert params.pool_size == 8 and int(params.max_steps_in_episode) == 600
+    assert params.start_observation.shape == (8, OBSERVATION_SIZE)
+    vehicle = params.starts.vehicle
+    np.testing.assert_allclose(np.asarray(vehicle.position)[4:, 2], 0.47, rtol=1e-5)
+    np.testing.assert_allclose(vehicle.velocity, 0, atol=1e-6)
+    observation, state = jax.vmap(env.reset, (0, None))(jax.random.split(KEY, 200), params)
+    assert len(np.unique(state.vehicle.position[:, :2], axis=0)) == 4
+    assert len(np.unique(observation, axis=0)) == 8
+
+
+def test_step_compiles_once_and_resets_by_itself():
+    terrain = terrain_map.stack([ground(hills()), ground(hills(height=0.5))])
+    config = NavigationConfig(horizon_seconds=0.5)
+    env, params = bicycle_env(terrain, circle_tasks(terrain, radius=50.0), config)
+    n = 16
+    states = jax.vmap(env.reset, (0, None))(jax.random.split(KEY, n), params)[1]
+    chex.clear_trace_counter()
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def step(key, states, params):
+        keys, actions = jax.random.split(key, n), jnp.broadcast_to(AHEAD, (n, 2))
+        return jax.vmap(env.step, (0, 0, 0, None))(keys, states, actions, params)
+
+    for i in range(1, 6):
+        _, states, _, terminated, truncated, info = out = step(jax.random.key(i), states, params)
+        assert not terminated.any() and truncated.all() == (i == 5)
+    # What the episode ended with, and the first of the next one.
+    assert (info["ending"] == Ending.TIMED_OUT).all() and (states.time == 0).all()
+    final, first = np.asarray(info["final_observation"]), np.asarray(out[0])
+    assert (final[:, 2] > 0.1).all() and (first[:, 2] == 0).all()
+    assert set(map(bytes, first)) <= set(map(bytes, np.asarray(params.start_observation)))
+
+
+def test_worlds_are_not_copied_per_vehicle():
+    worlds = terrain_map.stack([ground(hills())] * 8)
+    env, params = bicycle_env(worlds, circle_tasks(worlds))
+    n = 256
+    states = jax.vmap(env.start, (None, 0))(params, jnp.arange(n) % 80)[1]
+
+    def step(states, actions, params):
+        return jax.vmap(env.step_env, (None, 0, 0, None))(KEY, states, actions, params)
+
+    compiled = jax.jit(step).lower(states, jnp.zeros((n, 2)), params).compile()
+    memory = compiled.memory_analysis()
+    # One copy of one world for each vehicle would be 17 MB.
+    assert memory.temp_size_in_bytes < 4e6
+
+
+def test_equal_environments_are_one_static_argument():
+    assert NavigationEnv(KinematicBicycle()) == NavigationEnv(KinematicBicycle())
+    assert hash(NavigationEnv(KinematicBicycle())) == hash(NavigationEnv(KinematicBicycle()))
+
+
+def test_a_patch_must_cover_the_next_footprint():
+    with pytest.raises(ValueError, match="top speed"):
+        NavigationEnv(KinematicBicycle(), NavigationConfig(speed_range=(0.0, 60.0)))
+
+
+def test_a_model_that_cannot_stand_is_named():
+    env = NavigationEnv(KinematicBicycle())
+    broken = BICYCLE.replace(wheelbase=jnp.float32(jnp.nan))
+    with pytest.raises(ValueError, match=r"dynamics: expected a finite state .* in task 0"):
+        env.make_params(broken, ground(), task((0.0, 0.0), (30.0, 0.0)))

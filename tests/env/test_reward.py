@@ -1,0 +1,59 @@
+import math
+
+import jax.numpy as jnp
+import pytest
+
+from vertiwm_jax.env.reward import RewardConfig, reward
+from vertiwm_jax.env.termination import Ending, first_ending, is_terminal
+
+
+def value(**changes):
+    terms = {
+        "progress": 0.0,
+        "distance": 30.0,
+        "stalled": False,
+        "roll": 0.0,
+        "pitch": 0.0,
+        "vertical_speed": 0.0,
+        "ending": Ending.RUNNING,
+    }
+    terms.update(changes)
+    arrays = {name: jnp.asarray(x) for name, x in terms.items()}
+    return float(reward(RewardConfig(), **arrays))
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"progress": 0.4}, 20.0),
+        ({"progress": -0.1}, -5.0),
+        ({"stalled": True}, -10.0),
+        ({"roll": math.radians(29.9)}, 0.0),
+        # -20 (45/30) (15 deg in rad), either sign, roll or pitch.
+        ({"roll": math.radians(-45)}, -7.853982),
+        ({"pitch": math.radians(45)}, -7.853982),
+        ({"vertical_speed": -0.5}, -0.5),
+        ({"ending": Ending.GOAL}, 3000.0),
+        ({"ending": Ending.STUCK}, -300.0),
+        ({"ending": Ending.OFF_MAP}, -600.0),
+        ({"ending": Ending.ROLLED_OVER}, -600.0),
+        ({"ending": Ending.COLLIDED}, -600.0),
+        ({"ending": Ending.DIVERGED}, -600.0),
+        ({"ending": Ending.TIMED_OUT}, -400.0),
+        ({"progress": 0.2, "stalled": True, "ending": Ending.TIMED_OUT}, -400.0),
+    ],
+)
+def test_terms_are_those_computed_by_hand(changes, expected):
+    assert value(**changes) == pytest.approx(expected, rel=1e-5, abs=1e-6)
+
+
+def test_the_gravest_ending_counts_and_only_time_out_is_not_terminal():
+    yes, no = jnp.array(True), jnp.array(False)
+    conditions = dict.fromkeys(Ending, no)
+    del conditions[Ending.RUNNING]
+    assert int(first_ending(conditions)) == Ending.RUNNING
+    both = conditions | {Ending.GOAL: yes, Ending.ROLLED_OVER: yes, Ending.TIMED_OUT: yes}
+    assert int(first_ending(both)) == Ending.ROLLED_OVER
+    late = conditions | {Ending.GOAL: yes, Ending.TIMED_OUT: yes}
+    assert int(first_ending(late)) == Ending.GOAL
+    assert [bool(is_terminal(jnp.int32(e))) for e in Ending] == [False, False] + [True] * 6

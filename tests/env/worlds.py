@@ -1,0 +1,82 @@
+"""Small grounds and vehicles that the tests of environments and evaluation share."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv, NavigationParams
+from vertiwm_jax.env.tasks import Tasks
+from vertiwm_jax.mechanics.kinematic import BicycleParams, KinematicBicycle
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
+
+BICYCLE = BicycleParams(
+    wheelbase=jnp.float32(3.378),
+    track=jnp.float32(1.82),
+    ride_height=jnp.float32(0.47),
+    speed_lag=jnp.float32(0.3),
+)
+GRASS, SNOW = 3, 9
+
+
+def hills(size: int = 129, height: float = 1.0, wavelength: float = 40.0) -> np.ndarray:
+    """`[size, size]` m of smooth waves, not below 0; amplitude `height` each way."""
+    x = np.arange(size)
+    wave = np.sin(2 * np.pi * x / wavelength)
+    return (height * (2 + wave[None, :] + np.cos(2 * np.pi * x / wavelength)[:, None])).astype(
+        np.float32
+    )
+
+
+def ground(elevation: np.ndarray | None = None, obstacles: Any = None) -> TerrainMap:
+    """Grass, 128 m x 128 m about (0, 0); flat unless `elevation` is given."""
+    if elevation is None:
+        elevation = np.zeros((129, 129))
+    return terrain_map.build(elevation, np.full((16, 16), GRASS), obstacles=obstacles)
+
+
+def task(start: Any, goal: Any, yaw: float = 0.0) -> Tasks:
+    """One task on world 0."""
+    return Tasks(
+        world=jnp.zeros(1, jnp.int32),
+        start=jnp.asarray([start], jnp.float32),
+        yaw=jnp.asarray([yaw], jnp.float32),
+        goal=jnp.asarray([goal], jnp.float32),
+    )
+
+
+def bicycle_env(
+    terrain: TerrainMap, tasks: Tasks, config: NavigationConfig | None = None
+) -> tuple[NavigationEnv, NavigationParams]:
+    """A kinematic bicycle over `terrain`."""
+    env = NavigationEnv(KinematicBicycle(), config or NavigationConfig())
+    return env, env.make_params(BICYCLE, terrain, tasks)
+
+
+@dataclass(frozen=True)
+class Scripted:
+    """Stands still while starts settle, then goes through states given as parameters.
+
+    Parameters are states with leaves `[T, 3]`; history counts the steps that moved.
+    """
+
+    settle_steps: int
+
+    def init(self, params: VehicleState, terrain: TerrainMap, state: VehicleState) -> jax.Array:
+        return jnp.int32(-self.settle_steps)
+
+    def step(
+        self,
+        params: VehicleState,
+        terrain: TerrainMap,
+        history: jax.Array,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, jax.Array]:
+        there = jax.tree.map(lambda x: x[jnp.maximum(history, 0)], params)
+        moved = jax.tree.map(lambda a, b: jnp.where(history < 0, a, b), state, there)
+        return moved, history + 1

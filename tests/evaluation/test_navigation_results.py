@@ -1,0 +1,134 @@
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from env.worlds import bicycle_env, ground, hills
+from flax import struct
+from scipy.stats import binomtest
+
+from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.tasks import circle_tasks
+from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.evaluation import navigation
+from vertiwm_jax.evaluation.controllers import RandomActions, StraightToGoal
+from vertiwm_jax.terrain import map as terrain_map
+
+CONFIG = NavigationConfig(horizon_seconds=12.0)
+
+
+@pytest.fixture(scope="module")
+def short():
+    """Six tasks of 52 m, of which some are blocked and none takes longer than 12 s."""
+    block = [[0.0, 0.0, 12.0, 3.0, 2.0]]
+    terrain = terrain_map.stack([ground(hills(), block), ground(hills())])
+    return bicycle_env(terrain, circle_tasks(terrain, radius=26.0, pairs=3), CONFIG)
+
+
+@pytest.fixture(scope="module")
+def straight(short):
+    return navigation.evaluate(*short, StraightToGoal(CONFIG), jax.random.key(0))
+
+
+def test_agrees_with_a_loop_over_episodes(short, straight):
+    env, params = short
+    step, policy = jax.jit(env.step_env), StraightToGoal(CONFIG)
+    for task in range(params.pool_size):
+        observation, state = env.start(params, task)
+        positions, tilts = [state.vehicle.position], []
+        while state.ending == Ending.RUNNING:
+            action = policy(observation, jax.random.key(0))
+            observation, state, *_ = step(jax.random.key(0), state, action, params)
+            positions.append(state.vehicle.position)
+            tilts.append(np.abs(state.vehicle.rpy))
+        positions, tilts = np.array(positions), np.array(tilts)
+        assert straight.ending[task] == state.ending
+        assert straight.steps[task] == len(tilts) == state.time
+        np.testing.assert_allclose(straight.abs_roll[task], tilts[:, 0].mean(), rtol=1e-3)
+        np.testing.assert_allclose(straight.abs_pitch[task], tilts[:, 1].mean(), rtol=1e-3)
+        driven = np.linalg.norm(np.diff(positions, axis=0), axis=-1).sum()
+        np.testing.assert_allclose(straight.driven[task], driven, rtol=1e-3)
+        path, rpy = straight.path(task)
+        assert path.shape == rpy.shape == positions.shape
+        np.testing.assert_allclose(path, positions, atol=1e-2)
+        left = np.linalg.norm(positions[-1] - np.asarray(state.goal))
+        np.testing.assert_allclose(straight.final_distance[task], left, atol=1e-2)
+
+
+def test_summary_counts(straight):
+    summary = navigation.Summary.of(straight)
+    ending = np.asarray(straight.ending)
+    assert set(summary.endings) == {"goal", "collided"}
+    assert summary.successes == (ending == Ending.GOAL).sum() and summary.tasks == 6
+    assert sum(summary.endings.values()) == 6
+    seconds = 0.1 * np.asarray(straight.steps)[ending == Ending.GOAL]
+    assert summary.seconds == pytest.approx(seconds.mean(), rel=1e-5)
+    assert summary.seconds_deviation == pytest.approx(seconds.std(), rel=1e-3, abs=1e-5)
+    every_step = np.concatenate([straight.path(i)[1][1:] for i in range(6)])
+    roll, pitch, _ = np.abs(every_step).mean(axis=0)
+    assert summary.abs_roll == pytest.approx(roll, rel=1e-4)
+    assert summary.abs_pitch == pytest.approx(pitch, rel=1e-4)
+
+
+def test_time_runs_out_and_nobody_succeeds(short):
+    env, params = short
+    params = params.replace(max_steps_in_episode=jnp.int32(7))
+    result = navigation.evaluate(env, params, StraightToGoal(CONFIG), jax.random.key(0))
+    assert (result.ending == Ending.TIMED_OUT).all() and (result.steps == 7).all()
+    row = navigation.Summary.of(result)
+    assert row.successes == 0 and np.isnan(row.seconds)
+    assert "0/6" in navigation.format_table({"slow": row})
+
+
+def test_other_weights_do_not_compile_again(short):
+    @struct.dataclass
+    class Weighted:
+        weight: jax.Array
+
+        @chex.assert_max_traces(n=1)
+        def __call__(self, observation, key):
+            return jnp.tanh(self.weight * observation[:2])
+
+    chex.clear_trace_counter()
+    for weight in (0.0, 1.0):
+        navigation.evaluate(*short, Weighted(jnp.float32(weight)), jax.random.key(0))
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(0, 10), (6, 20), (18, 20), (100, 100)])
+def test_wilson_interval_is_scipy_s(successes, trials):
+    expected = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
+    found = navigation.wilson_interval(successes, trials)
+    np.testing.assert_allclose(found, (expected.low, expected.high), atol=2e-5)
+
+
+def test_table_has_the_paper_s_columns(straight):
+    row = dataclasses.replace(
+        navigation.Summary.of(straight),
+        tasks=20,
+        successes=18,
+        success_interval=(0.699, 0.972),
+        seconds=27.54,
+        seconds_deviation=1.26,
+        abs_roll=np.radians(4.84),
+        abs_pitch=np.radians(3.76),
+        driven=113.06,
+        endings={"goal": 18, "stuck": 2},
+    )
+    lines = navigation.format_table({"ppo": row, "straight to goal": row}).splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert cells[0][:6] == ["policy", "success", "95 %", "time [s]", "roll [deg]", "pitch [deg]"]
+    assert cells[2] == [
+        "ppo", "18/20", "70-97", "27.5 ± 1.3", "4.84", "3.76", "113.1", "goal 18, stuck 2"
+    ]  # fmt: skip
+    assert len({len(line) for line in lines}) == 1
+
+
+def test_random_actions_fill_the_box():
+    policy = RandomActions()
+    keys = jax.random.split(jax.random.key(0), 1000)
+    actions = np.asarray(jax.vmap(policy, (None, 0))(jnp.zeros(5), keys))
+    assert actions.shape == (1000, 2) and np.abs(actions).max() <= 1
+    np.testing.assert_allclose(actions.mean(0), 0, atol=0.08)
+    np.testing.assert_allclose(actions.std(0), 3**-0.5, atol=0.03)

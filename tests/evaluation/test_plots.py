@@ -1,0 +1,53 @@
+import io
+
+import numpy as np
+import pytest
+from env.worlds import GRASS, SNOW, ground, hills
+
+from vertiwm_jax.env import picture
+from vertiwm_jax.evaluation import plots
+from vertiwm_jax.terrain import map as terrain_map
+
+
+def test_hills_are_lit_from_the_north_west_and_classes_tinted():
+    x = np.arange(129.0)
+    ridge = np.broadcast_to(8 - np.abs(x - 64) / 8, (129, 129))  # runs south to north
+    semantic = np.full((16, 16), GRASS)
+    semantic[:8, :8] = SNOW
+    shaded = picture.shaded(terrain_map.build(ridge, semantic), 0, enlarge=2)
+    assert shaded.shape == (256, 256, 3) and shaded.min() >= 0 and shaded.max() <= 1
+    assert shaded[200, 40].sum() > shaded[200, 216].sum()  # western flank, eastern flank
+    assert shaded[40, 40, 2] > shaded[200, 40, 2] + 0.1  # snow north-west, grass south-west
+    turned = picture.shaded(terrain_map.build(ridge.T, semantic), 0, enlarge=2)
+    assert turned[40, 200].sum() > turned[216, 200].sum()  # northern flank, southern flank
+
+
+def test_trajectories_show_every_drive():
+    t = np.linspace(0, 1, 50)[:, None]
+    drives = {
+        name: (t * [60.0, y, 0.0], 0.2 * np.sin(9 * t) * [1.0, 0.5, 0.0])
+        for name, y in (("learned", 30.0), ("straight to goal", 0.0))
+    }
+    figure = plots.trajectories(ground(hills()), 0, drives, np.array([60.0, 0.0]), 8.0, 0.1)
+    overhead, roll, pitch = figure.axes
+    lines = {line.get_label(): line.get_xydata() for line in overhead.lines}
+    np.testing.assert_allclose(lines["learned"], drives["learned"][0][:, :2])
+    assert len(roll.lines) == len(pitch.lines) == 2
+    peak = np.degrees(np.abs(drives["learned"][1][:, 0]).max())
+    assert np.abs(roll.lines[0].get_ydata()).max() == pytest.approx(peak)
+    assert roll.lines[0].get_xdata()[-1] == pytest.approx(4.9)
+    assert roll.lines[0].get_linestyle() != roll.lines[1].get_linestyle()
+    figure.savefig(file := io.BytesIO())
+    assert file.getvalue()[:4] == b"\x89PNG"
+
+
+def test_learning_curves_draw_every_metric_of_every_run():
+    runs = {
+        f"seed {i}": {"step": np.arange(5), "success": i * np.arange(5), "loss": np.ones(5)}
+        for i in range(3)
+    }
+    labels = {"success": "success rate", "loss": "value loss"}
+    figure = plots.learning_curves(runs, "step", labels, "transitions")
+    assert [axes.get_ylabel() for axes in figure.axes] == ["success rate", "value loss"]
+    np.testing.assert_array_equal(figure.axes[0].lines[2].get_ydata(), 2 * np.arange(5))
+    figure.savefig(io.BytesIO())

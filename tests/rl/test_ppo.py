@@ -1,0 +1,140 @@
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rl.probes import Constant, Delayed, Endless, ProbeParams, Sign, Target
+
+from vertiwm_jax.rl.ppo import PPO, PPOConfig
+
+CONFIG = PPOConfig(
+    transitions=20_000,
+    num_envs=16,
+    num_steps=16,
+    minibatches=2,
+    epochs=8,
+    discount=0.9,
+    hidden=(32,),
+    learning_rate=1e-2,
+    normalise_observations=False,
+    normalise_rewards=False,
+)
+
+
+TARGET = PPO(Target(), PPOConfig(**{**vars(CONFIG), "transitions": 40_000}))
+
+
+@functools.cache
+def compiled(ppo):
+    chex.clear_trace_counter()  # chex counts by name
+    return jax.jit(ppo.init), jax.jit(chex.assert_max_traces(ppo.iterate, n=1), donate_argnums=1)
+
+
+def train(ppo, env_params=ProbeParams(), seed=0, iterations=None):
+    """The state and the metrics of the last of `iterations`, all by default."""
+    init, iterate = compiled(ppo)
+    state, metrics = init(env_params, jax.random.key(seed)), {}
+    for _ in range(ppo.config.iterations if iterations is None else iterations):
+        state, metrics = iterate(env_params, state)
+    return state, metrics
+
+
+def values(ppo, state, *observations):
+    return np.asarray(ppo.value(state, jnp.array(observations, jnp.float32)[:, None]))
+
+
+@pytest.mark.parametrize("normalise", [False, True])
+def test_constant_reward_is_its_value(normalise):
+    config = {"normalise_observations": normalise, "normalise_rewards": False}
+    ppo = PPO(Constant(), PPOConfig(**{**vars(CONFIG), **config}))
+    state, metrics = train(ppo)
+    np.testing.assert_allclose(values(ppo, state, 0.0), 1.0, atol=0.02)
+    assert float(metrics["episode_return"]) == 1.0
+    assert float(metrics["episode_length"]) == 1.0
+    assert float(metrics["episodes"]) == CONFIG.batch
+
+
+@pytest.mark.parametrize("normalise", [False, True])
+def test_value_depends_on_the_observation(normalise):
+    config = {"normalise_observations": normalise, "normalise_rewards": normalise}
+    ppo = PPO(Sign(), PPOConfig(**{**vars(CONFIG), **config}))
+    np.testing.assert_allclose(values(ppo, train(ppo)[0], -1.0, 1.0), [-1.0, 1.0], atol=0.05)
+
+
+def test_delayed_reward_is_discounted():
+    ppo = PPO(Delayed(), CONFIG, outcomes=lambda info: {"last": info["time"]})
+    state, metrics = train(ppo)
+    np.testing.assert_allclose(values(ppo, state, 0.0, 1.0), [0.9, 1.0], atol=0.03)
+    assert float(metrics["last"]) == 2.0
+    assert float(metrics["episode_return"]) == 1.0
+    assert float(metrics["episodes"]) == CONFIG.batch / 2
+
+
+@pytest.mark.parametrize("normalise", [False, True])
+def test_policy_finds_the_action_that_depends_on_the_observation(normalise):
+    config = {"normalise_observations": normalise, "normalise_rewards": normalise}
+    ppo = PPO(Target(), PPOConfig(**{**vars(TARGET.config), **config}))
+    state, _ = train(ppo)
+    # Actions 0 and 2 of [-2, 4] are -1/3 and 1/3 of [-1, 1].
+    actions = ppo.policy(ProbeParams(), state)(jnp.array([[-1.0], [1.0]]))
+    np.testing.assert_allclose(actions[:, 0], [-1 / 3, 1 / 3], atol=0.05)
+
+
+def test_truncation_is_bootstrapped_and_termination_is_not():
+    endless = PPO(Endless(), CONFIG)
+    state, metrics = train(endless, ProbeParams(max_steps_in_episode=5))
+    assert float(metrics["episode_length"]) == 5
+    np.testing.assert_allclose(values(endless, state, 0.0), 1 / (1 - 0.9), rtol=0.03)
+
+    finite = PPO(Constant(steps=2), CONFIG)
+    state, _ = train(finite)
+    np.testing.assert_allclose(values(finite, state, 0.0, 1.0), [1.9, 1.0], rtol=0.03)
+
+
+def test_several_seeds_are_the_single_ones():
+    ppo, iterations, env_params = TARGET, 3, ProbeParams()
+    keys = jnp.stack([jax.random.key(seed) for seed in (0, 1)])
+    states = jax.jit(jax.vmap(ppo.init, (None, 0)))(env_params, keys)
+    iterate = jax.jit(jax.vmap(ppo.iterate, (None, 0)))
+    for _ in range(iterations):
+        states, _ = iterate(env_params, states)
+    for seed in (0, 1):
+        alone, _ = train(ppo, env_params, seed, iterations)
+        together = jax.tree.map(lambda x, seed=seed: x[seed], states.params)
+        chex.assert_trees_all_close(together, alone.params, rtol=1e-3, atol=1e-5)
+
+
+def test_same_seed_same_numbers():
+    first, second = (train(TARGET, iterations=2)[0] for _ in range(2))
+    chex.assert_trees_all_equal(first, second)
+
+
+def test_value_clip_bounds_what_is_learned_in_an_iteration():
+    config = {"value_clip": 0.01, "learning_rate": 1e-3, "minibatches": 16}
+    ppo = PPO(Constant(), PPOConfig(**{**vars(CONFIG), **config}))
+    before, after = (values(ppo, train(ppo, iterations=n)[0], 0.0)[0] for n in (0, 1))
+    assert 0 < abs(after - before) < 0.05  # Adam's momentum goes a little beyond
+
+
+@pytest.mark.parametrize(
+    ("schedule", "share"), [("constant", 1.0), ("linear", 0.5), ("cosine", 0.5)]
+)
+def test_learning_rate_halfway(schedule, share):
+    config = PPOConfig(**{**vars(CONFIG), "schedule": schedule})
+    halfway = config.iterations * config.epochs * config.minibatches // 2
+    np.testing.assert_allclose(
+        config.learning_rate_schedule(halfway), share * config.learning_rate, rtol=1e-2
+    )
+
+
+def test_minibatches_must_divide_the_batch():
+    with pytest.raises(ValueError, match="minibatches: 7 does not divide"):
+        PPOConfig(num_envs=4, num_steps=4, minibatches=7)
+
+
+def test_entropy_weight_widens_the_policy():
+    ppo = PPO(Constant(), PPOConfig(**{**vars(CONFIG), "entropy_weight": 0.1}))
+    first, last = (train(ppo, iterations=n)[1]["entropy"] for n in (1, 10))
+    assert float(last) > float(first) + 0.1

@@ -1,0 +1,200 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.classes import STANDARD
+
+MUD, CONCRETE, GRASS = (STANDARD.names.index(name) for name in ("mud", "concrete", "grass"))
+
+
+@pytest.fixture(scope="module")
+def terrain():
+    """Three rough worlds of 33 x 41 vertices at 0.5 m, off-centre, with 2 m cells of any class."""
+    rng = np.random.default_rng(0)
+    return terrain_map.stack(
+        [
+            terrain_map.build(
+                rng.uniform(0, 3, (33, 41)),
+                rng.integers(0, 10, (8, 10)),
+                resolution=0.5,
+                origin=(-7.0, 11.0),
+            )
+            for _ in range(3)
+        ]
+    )
+
+
+surface_of = jax.jit(lambda terrain, world, xy: query.surface(terrain.select(world), xy))
+patches_of = jax.jit(lambda terrain, world, xy, yaw: query.patches(terrain.select(world), xy, yaw))
+
+
+def reference_surface(terrain, world, x, y):
+    """One point at a time, in double precision, from the definition."""
+    z, semantic = np.asarray(terrain.elevation[world], float), np.asarray(terrain.semantic[world])
+    x0, y0 = np.asarray(terrain.origin, float)
+    step = float(terrain.resolution)
+    rows, columns = z.shape
+    u = np.clip((x - x0) / step, 0, columns - 1)
+    v = np.clip((y0 - y) / step, 0, rows - 1)
+    c, r = min(int(u), columns - 2), min(int(v), rows - 2)
+    i = min(int(v / (rows - 1) * semantic.shape[0]), semantic.shape[0] - 1)
+    j = min(int(u / (columns - 1) * semantic.shape[1]), semantic.shape[1] - 1)
+    kind = int(semantic[i, j])
+    right, up = u - c, 1 - (v - r)
+    tl, tr, bl, br = z[r, c], z[r, c + 1], z[r + 1, c], z[r + 1, c + 1]
+    if STANDARD.deformable[kind]:
+        height = (1 - up) * ((1 - right) * bl + right * br) + up * ((1 - right) * tl + right * tr)
+    elif right > up:  # triangle bl, br, tr
+        height = bl + right * (br - bl) + up * (tr - br)
+    else:  # triangle bl, tr, tl
+        height = bl + up * (tl - bl) + right * (tr - tl)
+    return height, kind, float(terrain.friction[world, i, j])
+
+
+def reference_patches(terrain, world, x, y, yaw):
+    z, semantic = np.asarray(terrain.elevation[world], float), np.asarray(terrain.semantic[world])
+    x0, y0 = np.asarray(terrain.origin, float)
+    step = float(terrain.resolution)
+    elevation, rgb = np.zeros((128, 128)), np.zeros((128, 128, 3))
+    for row in range(128):
+        for column in range(128):
+            ahead, left = 6.35 - 0.1 * row, 6.35 - 0.1 * column
+            px = x + np.cos(yaw) * ahead - np.sin(yaw) * left
+            py = y + np.sin(yaw) * ahead + np.cos(yaw) * left
+            u = np.clip((px - x0) / step, 0, z.shape[1] - 1)
+            v = np.clip((y0 - py) / step, 0, z.shape[0] - 1)
+            elevation[row, column] = z[int(v + 0.5), int(u + 0.5)] / 16 * 2 - 1
+            i = min(int(v / (z.shape[0] - 1) * semantic.shape[0]), semantic.shape[0] - 1)
+            j = min(int(u / (z.shape[1] - 1) * semantic.shape[1]), semantic.shape[1] - 1)
+            rgb[row, column] = STANDARD.rgb[semantic[i, j]] / 255.0 * 2 - 1
+    return elevation, rgb
+
+
+@pytest.mark.parametrize("pose", [(1.3, 2.7, 0.6), (-6.0, 10.0, -2.2)])
+def test_patches_equal_a_plain_loop(terrain, pose):
+    x, y, yaw = pose
+    found = patches_of(terrain, 1, jnp.array([x, y]), jnp.float32(yaw))
+    elevation, rgb = reference_patches(terrain, 1, x, y, yaw)
+    # Pixels on a rounding border may fall either way in float32.
+    assert np.mean(np.abs(found.elevation - elevation) > 1e-5) < 1e-3
+    assert np.mean(np.abs(found.rgb - rgb).max(-1) > 1e-5) < 1e-3
+
+
+@pytest.mark.parametrize("eighth", range(8))
+def test_patches_show_bump_and_colour_where_they_are(eighth):
+    """A bump 4 m ahead and a patch of concrete 4 m to the left, placed by heading."""
+    yaw = eighth * np.pi / 4
+    vehicle = np.array([3.0, -5.0])
+    forward, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    axis = np.arange(129) * 0.25 - 16
+    x, y = axis[None, :], -axis[:, None]
+    bump, spot = vehicle + 4 * forward, vehicle + 4 * left
+    elevation = 16 * np.exp(-((x - bump[0]) ** 2 + (y - bump[1]) ** 2))
+    cell = np.arange(128) * 0.25 - 15.875
+    near = np.hypot(cell[None, :] - spot[0], -cell[:, None] - spot[1]) < 0.8
+    terrain = terrain_map.build(elevation, np.where(near, CONCRETE, GRASS), resolution=0.25)
+
+    found = patches_of(terrain, 0, jnp.array(vehicle, jnp.float32), jnp.float32(yaw))
+    row, column = np.unravel_index(np.argmax(found.elevation), (128, 128))
+    assert abs(row - 23.5) <= 2 and abs(column - 63.5) <= 2
+    coloured = np.argwhere(np.asarray(found.rgb)[..., 2] > 0)  # concrete alone is bluish
+    np.testing.assert_allclose(coloured.mean(0), [63.5, 23.5], atol=1.5)
+    assert len(coloured) == pytest.approx(np.pi * 8**2, rel=0.1)
+
+
+def test_patches_are_bounded_and_batch_over_worlds(terrain):
+    xy = jnp.array([[0.0, 0.0], [100.0, -100.0], [-1e9, 3.0]])
+    axes = (None, 0, 0, 0)
+    batched = jax.jit(jax.vmap(lambda t, w, p, a: query.patches(t.select(w), p, a), axes))
+    found = batched(terrain, jnp.array([0, 1, 2]), xy, jnp.zeros(3))
+    assert found.elevation.shape == (3, 128, 128) and found.rgb.shape == (3, 128, 128, 3)
+    for world in range(3):
+        alone = patches_of(terrain, world, xy[world], jnp.float32(0))
+        np.testing.assert_array_equal(found.elevation[world], alone.elevation)
+        np.testing.assert_array_equal(found.rgb[world], alone.rgb)
+    # Far off the map, every pixel is its nearest corner.
+    np.testing.assert_allclose(found.elevation[1], terrain.elevation[1, -1, -1] / 8 - 1, atol=1e-6)
+    assert np.abs(found.elevation).max() <= 1 and np.abs(found.rgb).max() <= 1
+
+
+@pytest.mark.parametrize("pose", [(np.nan, np.nan, 0.0), (0.0, 0.0, np.nan)])
+def test_nan_pose_sees_the_first_vertex(terrain, pose):
+    found = patches_of(terrain, 2, jnp.array(pose[:2]), jnp.float32(pose[2]))
+    np.testing.assert_allclose(found.elevation, terrain.elevation[2, 0, 0] / 8 - 1, atol=1e-6)
+    assert np.isfinite(found.rgb).all()
+
+
+def test_no_gradient_flows_from_patches_to_the_pose(terrain):
+    def total(xy, yaw):
+        found = query.patches(terrain, xy, yaw)
+        return found.elevation.sum() + found.rgb.sum()
+
+    by_xy, by_yaw = jax.grad(total, (0, 1))(jnp.array([1.0, 2.0]), jnp.float32(0.3))
+    assert not np.any(by_xy) and not np.any(by_yaw)
+
+
+def test_surface_equals_the_definition(terrain):
+    rng = np.random.default_rng(1)
+    # A few points lie off the map.
+    xy = np.float32(rng.uniform((-8, -6), (14, 12), (4, 75, 2)))
+    found = surface_of(terrain, 1, xy)
+    expected = np.array([[reference_surface(terrain, 1, *p) for p in row] for row in xy])
+    np.testing.assert_allclose(found.height, expected[..., 0], atol=2e-5)
+    np.testing.assert_array_equal(found.semantic, expected[..., 1])
+    np.testing.assert_allclose(found.friction, expected[..., 2])
+
+
+def test_gradient_is_that_of_height_and_of_finite_differences(terrain):
+    rng = np.random.default_rng(2)
+    xy = np.float32(rng.uniform((-8, -6), (14, 12), (200, 2)))
+    found = surface_of(terrain, 0, xy)
+    automatic = jax.jit(jax.vmap(jax.grad(lambda p: query.surface(terrain, p).height)))(xy)
+    np.testing.assert_allclose(found.gradient, automatic, atol=1e-5)
+    step = 1e-4
+    for axis, offset in enumerate(np.eye(2) * step):
+        ahead, behind = (
+            np.array([reference_surface(terrain, 0, *p) for p in xy + sign * offset])[:, 0]
+            for sign in (1, -1)
+        )
+        near = np.abs((ahead - behind) / (2 * step) - found.gradient[:, axis]) < 1e-3
+        assert near.mean() > 0.99  # the others straddle an edge
+
+
+def test_soil_is_bilinear_and_rigid_ground_two_triangles():
+    """One cell with its top right corner raised: 0.25 in the middle of soil, 0.5 on the split."""
+    corner = np.array([[0.0, 1.0], [0.0, 0.0]])
+    centre, lower = jnp.array([0.0, 0.0]), jnp.array([0.25, -0.25])
+    for kind, middle, below in ((MUD, 0.25, 0.75 * 0.25), (CONCRETE, 0.5, 0.25)):
+        terrain = terrain_map.build(corner, np.array([[kind]]))
+        assert surface_of(terrain, 0, centre).height == pytest.approx(middle)
+        assert surface_of(terrain, 0, lower).height == pytest.approx(below)
+        assert query.height(terrain, centre) == pytest.approx(0.25)
+    # The other diagonal is no ridge of rigid ground: a raised top left corner leaves it flat.
+    terrain = terrain_map.build(corner[:, ::-1], np.array([[CONCRETE]]))
+    assert surface_of(terrain, 0, centre).height == pytest.approx(0.0)
+
+
+def test_nan_and_infinite_points_are_finite_with_finite_gradients(terrain):
+    xy = jnp.array([[np.nan, 0.0], [0.0, np.nan], [np.inf, -np.inf]])
+    found = surface_of(terrain, 0, xy)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+    assert found.height[2] == terrain.elevation[0, -1, -1]
+    slope = jax.vmap(jax.grad(lambda p: query.surface(terrain, p).height))(xy)
+    assert np.isfinite(slope).all()
+
+
+def test_normal_stands_on_the_slope():
+    up = query.normal(jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, -np.sqrt(3)]]))
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(up, [[0, 0, 1], [-half, 0, half], [0, 0.75**0.5, 0.5]], atol=1e-6)
+
+
+def test_footprint_must_fit_the_patch():
+    query.footprint_covered(2.4, 8.0)
+    with pytest.raises(ValueError, match=r"12.8 m .* found .*6\.9 m > 6\.4 m; keep the top speed"):
+        query.footprint_covered(2.4, 45.0)
+    with pytest.raises(ValueError, match="patch"):
+        query.footprint_covered(float("nan"), 4.0)

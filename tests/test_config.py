@@ -1,0 +1,173 @@
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vertiwm_jax import config
+from vertiwm_jax.config import ConfigError
+
+
+@dataclass(frozen=True)
+class Optimizer:
+    """How weights move."""
+
+    learning_rate: float = 3e-4
+    """Step size."""
+    clip: float | None = None
+    anneal: bool = True
+
+    def __post_init__(self):
+        if self.learning_rate <= 0:
+            raise ValueError("learning_rate must be positive")
+
+
+@dataclass(frozen=True)
+class Task:
+    """Train something."""
+
+    name: str
+    seed: int = 0
+    suite: Literal["low", "mid", "high"] = "low"
+    folder: Path = Path("runs")
+    layers: tuple[int, ...] = (64, 64)
+    speeds: tuple[float, float] = (0.0, 8.0)
+    optimizer: Optimizer = field(default_factory=Optimizer)
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "task.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_every_kind_of_field_is_read(tmp_path):
+    text = """
+name: crawl
+seed: 3
+suite: high
+folder: out/here
+layers: [8, 16, 32]
+speeds: [-1, 4.5]
+optimizer: {learning_rate: 1e-3, clip: 1, anneal: off}
+"""
+    expected = Task(
+        "crawl", 3, "high", Path("out/here"), (8, 16, 32), (-1.0, 4.5), Optimizer(1e-3, 1.0, False)
+    )
+    found = config.load(Task, write(tmp_path, text))
+    assert found == expected
+    assert type(found.optimizer.clip) is float
+    assert config.load(Task, write(tmp_path, "name: x")) == Task("x")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("name: x\nsede: 1", ["sede", "unknown key", "did you mean 'seed'?"]),
+        ("name: x\noptimizer: {learnin_rate: 1}", ["optimizer.learnin_rate", "'learning_rate'?"]),
+        ("name: x\nseed: 1.5", ["seed", "expected int", "found 1.5 (float)"]),
+        ("name: x\nseed: true", ["seed", "expected int", "found True (bool)"]),
+        ("name: x\noptimizer: {anneal: 1}", ["optimizer.anneal", "expected bool", "found 1 (int)"]),
+        ("name: x\noptimizer: {clip: big}", ["optimizer.clip", "float or null", "'big' (str)"]),
+        ("name: x\noptimizer: {learning_rate: -1}", ["optimizer: learning_rate must be positive"]),
+        ("name: x\noptimizer: 3", ["optimizer", "mapping of Optimizer fields", "found 3"]),
+        ("name: x\nsuite: hihg", ["suite", "'low', 'mid', 'high'", "did you mean 'high'?"]),
+        ("name: x\nlayers: [1, two]", ["layers[1]", "expected int", "found 'two' (str)"]),
+        ("name: x\nlayers: 64", ["layers", "expected a list of int", "found 64 (int)"]),
+        ("name: x\nspeeds: [1]", ["speeds", "a list of 2", "found a list of 1"]),
+        ("name: 3", ["name", "expected str", "found 3 (int)"]),
+        ("name: x\nfolder: 3", ["folder", "expected a path", "found 3 (int)"]),
+        ("seed: 1", ["name", "missing", "expected str"]),
+        ("- 1", ["expected a mapping of Task fields", "found a list of 1"]),
+        ("name: x\nname: y", ["not valid YAML", "repeated key 'name'", "line 2"]),
+        ("name: [x", ["not valid YAML", "line"]),
+    ],
+)
+def test_bad_files_are_refused_in_one_clear_line(tmp_path, text, words):
+    path = write(tmp_path, text)
+    with pytest.raises(ConfigError) as error:
+        config.load(Task, path)
+    message = str(error.value)
+    assert "\n" not in message
+    assert message.startswith(f"{path}: ")
+    for word in words:
+        assert word in message
+
+
+def test_missing_and_unreadable_files(tmp_path):
+    write(tmp_path, "name: x")
+    with pytest.raises(ConfigError, match=r"tusk\.yaml: no such file.*did you mean 'task\.yaml'"):
+        config.load(Task, tmp_path / "tusk.yaml")
+    with pytest.raises(ConfigError, match="readable"):
+        config.load(Task, tmp_path)
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="UTF-8"):
+        config.load(Task, tmp_path / "binary.yaml")
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    name=st.text() | st.sampled_from(["1e3", "1_0e5", "on", "null", "3", "~", "1.5", ""]),
+    rate=st.floats(min_value=1e-300, allow_nan=False),
+    clip=st.none() | st.floats(allow_nan=False),
+    layers=st.lists(st.integers()).map(tuple),
+)
+def test_what_is_saved_is_read_back_equal(tmp_path_factory, name, rate, clip, layers):
+    path = tmp_path_factory.mktemp("saved") / "config.yaml"
+    task = Task(name, layers=layers, optimizer=Optimizer(rate, clip))
+    config.save(task, path)
+    assert config.load(Task, path) == task
+
+
+def test_the_command_line_overrides_the_file(tmp_path):
+    default = write(tmp_path, "name: x\nseed: 5\noptimizer: {clip: 2}")
+    other = tmp_path / "other.yaml"
+    other.write_text("name: y")
+    assert config.parse(Task, default, []) == Task("x", 5, optimizer=Optimizer(clip=2.0))
+    argv = ["--optimizer.learning-rate", "1e-2", "--layers", "1", "2", "--optimizer.clip", "None"]
+    argv += ["--optimizer.anneal", "False", "--suite", "mid"]
+    assert config.parse(Task, default, argv) == Task(
+        "x", 5, "mid", layers=(1, 2), optimizer=Optimizer(1e-2, None, False)
+    )
+    assert config.parse(Task, default, ["--seed", "7", "--config", str(other)]) == Task("y", 7)
+    assert config.parse(Task, default, [f"--config={other}"]) == Task("y")
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["--config", "nowhere.yaml"], ["door: error:", "nowhere.yaml: no such file"]),
+        (["--sede", "3"], ["--sede", "--seed"]),
+        (["--seed", "many"], ["--seed", "many"]),
+        (["--optimizer.learning-rate", "-1"], ["learning_rate must be positive"]),
+    ],
+)
+def test_a_bad_command_line_ends_with_status_2(tmp_path, capsys, argv, words):
+    with pytest.raises(SystemExit) as stop:
+        config.parse(Task, write(tmp_path, "name: x"), argv, prog="door")
+    assert stop.value.code == 2
+    captured = capsys.readouterr()
+    text = captured.out + captured.err
+    for word in words:
+        assert word in text
+
+
+def test_help_names_every_field(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        config.parse(Task, write(tmp_path, "name: x\nseed: 41"), ["--help"], prog="door")
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    options = ["--config", "--name", "--seed", "--suite", "--folder", "--layers", "--speeds"]
+    options += ["--optimizer.learning-rate", "--optimizer.clip", "--optimizer.anneal"]
+    for word in [*options, "Train something.", "Step size.", "41"]:
+        assert word in text
+
+
+def test_default_configs_are_found_by_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(config, "_FOLDERS", (tmp_path / "absent", tmp_path))
+    path = write(tmp_path, "name: x")
+    assert config.default_config("task") == path
+    with pytest.raises(ConfigError, match=r"no configuration named 'tusk'.*did you mean 'task'"):
+        config.default_config("tusk")

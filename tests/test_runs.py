@@ -1,0 +1,202 @@
+import contextlib
+import json
+import os
+import resource
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from tensorboardX.proto.event_pb2 import Event
+
+from vertiwm_jax import config, runs
+from vertiwm_jax.runs import Progress, Run, RunError, read_metrics, write_atomic
+
+
+@dataclass(frozen=True)
+class Settings:
+    seed: int = 1
+
+
+@contextlib.contextmanager
+def full_disk(after: int):
+    """Any file of more than `after` bytes fails as on a full disk, partial write included."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (after, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def scalars(folder: Path) -> list[tuple[int, str, float]]:
+    """What TensorBoard would read: records of length, checksum, payload, checksum."""
+    found = []
+    for file in sorted(folder.glob("events.out.tfevents.*")):
+        data = file.read_bytes()
+        while data:
+            length = int.from_bytes(data[:8], "little")
+            event = Event.FromString(data[12 : 12 + length])
+            found += [(event.step, v.tag, v.simple_value) for v in event.summary.value]
+            data = data[12 + length + 4 :]
+    return found
+
+
+def steps(folder: Path) -> list[float]:
+    return [entry["step"] for entry in read_metrics(folder)]
+
+
+def test_a_run_keeps_configuration_and_metrics(tmp_path):
+    with Run.create(tmp_path / "runs", "ppo", Settings(7)) as run:
+        run.log(10, {"return": 1.5})
+        # Readable at once by someone who watches, not only at the end.
+        assert read_metrics(run.folder)[0]["return"] == 1.5
+        run.log(20, {"return": 2.5, "loss": 0.25})
+    assert run.folder.parent == tmp_path / "runs"
+    assert run.folder.name.startswith("ppo-20")
+    assert config.load(Settings, run.folder / "config.yaml") == Settings(7)
+    first, second = read_metrics(run.folder)
+    assert (first["step"], second["step"], second["loss"]) == (10, 20, 0.25)
+    assert first["wall_time"] <= second["wall_time"]
+    assert scalars(run.folder) == [(10, "return", 1.5), (20, "return", 2.5), (20, "loss", 0.25)]
+
+
+def test_two_runs_of_one_second_have_two_folders(tmp_path):
+    made = {Run.create(tmp_path, "a", Settings()).folder for _ in range(3)}
+    assert len(made) == 3
+
+
+def test_resuming_drops_what_followed_the_checkpoint(tmp_path):
+    with Run.create(tmp_path, "ppo", Settings()) as run:
+        for step in range(5):
+            run.log(step, {"return": float(step)})
+    with Run.open(run.folder, step=2) as again:
+        assert steps(run.folder) == [0, 1, 2]
+        again.log(3, {"return": 30.0})
+    assert steps(run.folder) == [0, 1, 2, 3]
+    assert read_metrics(run.folder)[-1]["return"] == 30.0
+    assert (3, "return", 30.0) in scalars(run.folder)
+
+
+def test_a_torn_last_line_is_dropped(tmp_path):
+    with Run.create(tmp_path, "ppo", Settings()) as run:
+        run.log(1, {"return": 1.0})
+    path = run.folder / runs.METRICS
+    whole = path.read_bytes()
+    path.write_bytes(whole + b'{"step": 2, "retu')
+    assert steps(run.folder) == [1]
+    Run.open(run.folder, step=9).close()
+    assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize("line", ["{broken", "3", '{"return": 1}', '{"step": null}'])
+def test_a_damaged_line_is_named(tmp_path, line):
+    (tmp_path / runs.METRICS).write_text('{"step": 1}\n' + line + '\n{"step": 2}\n')
+    with pytest.raises(RunError, match=r"metrics\.jsonl: line 2: expected a JSON object"):
+        read_metrics(tmp_path)
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(RunError, match=r"metrics\.jsonl: cannot read"):
+        Run.open(tmp_path, step=0)
+    (tmp_path / "file").touch()
+    with pytest.raises(RunError, match="file: cannot start a run there"):
+        Run.create(tmp_path / "file", "ppo", Settings())
+
+
+def test_a_full_disk_keeps_the_metrics_whole(tmp_path):
+    run = Run.create(tmp_path, "ppo", Settings())
+    run.log(1, {"return": 1.0})
+    before = (run.folder / runs.METRICS).read_bytes()
+    refused = pytest.raises(RunError, match=r"metrics\.jsonl: cannot append")
+    with refused, run, full_disk(after=len(before) + 10):
+        run.log(2, {"return": 2.0})
+    assert (run.folder / runs.METRICS).read_bytes() == before
+
+
+def test_a_full_disk_under_tensorboard_is_told(tmp_path):
+    run = Run.create(tmp_path, "ppo", Settings())
+    refused = pytest.raises(RunError, match="cannot write TensorBoard events")
+    with refused, run, full_disk(after=1500):
+        for step in range(10):
+            run.log(step, {f"a_rather_long_name_of_a_metric_{i}": 0.0 for i in range(3)})
+    assert steps(run.folder) == list(range(len(steps(run.folder))))
+
+
+def test_write_atomic_replaces(tmp_path):
+    path = tmp_path / "table.txt"
+    write_atomic(path, "grün")
+    write_atomic(path, "blau")
+    assert path.read_text(encoding="utf-8") == "blau"
+    write_atomic(path, b"\x00\x01")
+    assert path.read_bytes() == b"\x00\x01"
+    assert os.listdir(tmp_path) == ["table.txt"]
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path):
+    path = tmp_path / "plot.png"
+    write_atomic(path, b"old")
+    with full_disk(after=1000), pytest.raises(RunError, match=r"plot\.png: cannot write"):
+        write_atomic(path, b"x" * 5000)
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["plot.png"]
+    with pytest.raises(RunError, match="No such file"):
+        write_atomic(tmp_path / "absent" / "plot.png", b"x")
+
+
+@pytest.mark.parametrize("moment", [(os, "fsync"), (Path, "replace")])
+def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch, moment):
+    path = tmp_path / "plot.png"
+    write_atomic(path, b"old")
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(*moment, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_atomic(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["plot.png"]
+
+
+def test_an_interrupted_log_leaves_whole_lines(tmp_path, monkeypatch):
+    run = Run.create(tmp_path, "ppo", Settings())
+    run.log(1, {"return": 1.0})
+    write = os.write
+
+    def half(descriptor, data):
+        write(descriptor, data[: len(data) // 2])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "write", half)
+    with pytest.raises(KeyboardInterrupt):
+        run.log(2, {"return": 2.0})
+    monkeypatch.undo()
+    run.log(2, {"return": 2.0})
+    assert steps(run.folder) == [1, 2]
+
+
+def test_progress_is_plain_lines_without_a_terminal(capsys):
+    with Progress(2000, "training", seconds_between_lines=3600) as progress:
+        for _ in range(4):
+            progress.advance(500, "return 3.2")
+    text = capsys.readouterr().out
+    assert text.count("\n") == 1
+    assert text.startswith("training 2,000/2,000  ")
+    assert text.endswith("0 s left  return 3.2\n")
+
+
+def test_progress_is_a_bar_on_a_terminal(capsys, monkeypatch):
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    with Progress(2000, "training") as progress:
+        progress.advance(2000, "return 3.2")
+    text = capsys.readouterr().out
+    assert "\x1b[" in text
+    assert "2,000/2,000" in text
+    assert "return 3.2" in text
+
+
+def test_metrics_are_standard_json_lines(tmp_path):
+    with Run.create(tmp_path, "ppo", Settings()) as run:
+        run.log(1, {"return": 1})
+    (line,) = (run.folder / runs.METRICS).read_text().splitlines()
+    assert set(json.loads(line)) == {"step", "wall_time", "return"}

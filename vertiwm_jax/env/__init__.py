@@ -1,0 +1,1 @@
+"""Any vehicle model as a navigation environment: tasks, observation, reward, endings, adapters."""

@@ -1,0 +1,146 @@
+"""Navigation for code that expects Gymnasium: one vehicle, or many at once."""
+
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from vertiwm_jax.env import picture
+from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
+from vertiwm_jax.state import STEP_SECONDS
+
+FRAMES_PER_SECOND = round(1 / STEP_SECONDS)
+
+
+def _spaces(env: NavigationEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    seen, action = env.observation_space(), env.action_space()
+    return (
+        gymnasium.spaces.Box(seen.low, seen.high, seen.shape, np.float32),
+        gymnasium.spaces.Box(action.low, action.high, action.shape, np.float32),
+    )
+
+
+class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One vehicle; passes `gymnasium.utils.env_checker.check_env`.
+
+    render_mode: None or "rgb_array", a picture of the world from above.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012
+
+    def __init__(
+        self, env: NavigationEnv, params: NavigationParams, render_mode: str | None = None
+    ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f'render_mode: expected None or "rgb_array", found {render_mode!r}')
+        self.observation_space, self.action_space = _spaces(env)
+        self.render_mode = render_mode
+        self._env, self._params = env, params
+        self._reset = jax.jit(env.reset_env)
+
+        @jax.jit
+        def step(
+            key: jax.Array, state: NavigationState, action: jax.Array, params: NavigationParams
+        ) -> tuple[Any, ...]:
+            result = env.step_env(jax.random.fold_in(key, state.time), state, action, params)
+            return *result, env.is_truncated(result[1], params)
+
+        self._step = step
+        self._state: NavigationState | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """A start drawn from the pool; there are no options."""
+        super().reset(seed=seed)
+        self._key = jax.random.key(self.np_random.integers(2**31))
+        observation, self._state = self._reset(self._key, self._params)
+        return np.asarray(observation), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One step of 0.1 s, without reset at the end."""
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("step: call reset() first")
+        observation, self._state, reward, terminated, info, truncated = self._step(
+            self._key, self._state, action, self._params
+        )
+        info = {name: value.item() for name, value in info.items()}
+        return np.asarray(observation), reward.item(), bool(terminated), bool(truncated), info
+
+    def render(self) -> np.ndarray | None:
+        """`[H, W, 3]` uint8, north up, or None without a render mode."""
+        if self.render_mode is None or self._state is None:
+            return None
+        state = jax.tree.map(np.asarray, self._state)
+        vehicle, config = state.vehicle, self._env.config
+        return picture.from_above(
+            self._params.terrain,
+            int(state.world),
+            vehicle.position,
+            float(vehicle.rpy[2]),
+            state.goal,
+            config.goal_radius,
+            config.chassis,
+        )
+
+
+class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Many vehicles in one compiled step, each reset in the step that ends its episode.
+
+    Where an episode ended, `info["final_obs"]` and `info["final_info"]` hold what it ended with.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(self, env: NavigationEnv, params: NavigationParams, num_envs: int) -> None:
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = _spaces(env)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._params = params
+        self._reset = jax.jit(jax.vmap(env.reset, (0, None)))
+        self._step = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))
+        self._state: NavigationState | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """New starts for all vehicles, drawn from the pool; there are no options."""
+        super().reset(seed=seed)
+        self._key = jax.random.key(self.np_random.integers(2**31))
+        observation, self._state = self._reset(self._next_keys(), self._params)
+        return np.array(observation), {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One step of 0.1 s; ended vehicles return the first observation of their next episode."""
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("step: call reset() first")
+        observation, self._state, *outcome = self._step(
+            self._next_keys(), self._state, actions, self._params
+        )
+        # Copies, since arrays of JAX are read-only.
+        reward, terminated, truncated, info = jax.tree.map(np.array, outcome)
+        final_observation = info.pop("final_observation")
+        del info["terminated"], info["truncated"]
+        over = terminated | truncated
+        infos = _with_masks(info, ~over)
+        if over.any():
+            final = np.full(self.num_envs, None, dtype=object)
+            for i in np.flatnonzero(over):
+                final[i] = final_observation[i]
+            infos |= _with_masks({"final_obs": final, "final_info": _with_masks(info, over)}, over)
+        return np.array(observation), reward, terminated, truncated, infos
+
+    def _next_keys(self) -> jax.Array:
+        self._key, now = jax.random.split(self._key)
+        return jax.random.split(now, self.num_envs)
+
+
+def _with_masks(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
+    """Gymnasium's form: beside each entry, whose it is."""
+    return info | {f"_{name}": mask.copy() for name in info}

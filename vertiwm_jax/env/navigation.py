@@ -1,0 +1,317 @@
+"""Goal navigation over any vehicle model, as a gymnax environment."""
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from gymnax.environments import environment, spaces
+
+from vertiwm_jax.dynamics import Dynamics, History, Params
+from vertiwm_jax.env import observation, tasks
+from vertiwm_jax.env.reward import RewardConfig, reward
+from vertiwm_jax.env.tasks import Chassis, Tasks
+from vertiwm_jax.env.termination import Ending, edge_distance, first_ending, is_terminal
+from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
+from vertiwm_jax.terrain import obstacles, query
+from vertiwm_jax.terrain.map import TerrainMap
+
+
+@dataclasses.dataclass(frozen=True)
+class NavigationConfig:
+    """What the task asks, static.
+
+    goal_radius: m from the goal, in three dimensions, at which it is reached.
+    horizon_seconds: time limit.
+    speed_range: commanded speed in m/s at actions -1 and 1; negative drives backwards.
+    steering_limit: front-wheel angle in rad at action 1.
+    map_margin: m from the edge of the map at which a vehicle is off it.
+    rollover_angle: rad of roll or of pitch.
+    stalled_speed, stuck_seconds: slower than this is stalled, for this long without a break stuck.
+    plausible_speed, plausible_height: m/s, and m from the ground, beyond which a model diverged.
+    settle_steps: steps of standing still before a start is handed out.
+    """
+
+    goal_radius: float = 8.0
+    horizon_seconds: float = 60.0
+    speed_range: tuple[float, float] = (0.0, 6.0)
+    steering_limit: float = 0.3725
+    map_margin: float = 1.0
+    rollover_angle: float = np.pi / 3
+    stalled_speed: float = 0.3
+    stuck_seconds: float = 5.0
+    plausible_speed: float = 30.0
+    plausible_height: float = 4.0
+    settle_steps: int = 15
+    chassis: Chassis = dataclasses.field(default_factory=Chassis)
+    reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
+
+    def command(self, action: jax.Array) -> Command:
+        """`[..., 2]` action, clipped to [-1, 1], to the command it stands for."""
+        action = jnp.clip(action, -1.0, 1.0)
+        low, high = self.speed_range
+        speed = low + (action[..., 0] + 1) / 2 * (high - low)
+        return Command(speed, action[..., 1] * self.steering_limit)
+
+    def action(self, command: Command) -> jax.Array:
+        """The `[..., 2]` action of a command, clipped to [-1, 1]; the inverse of `command`."""
+        low, high = self.speed_range
+        speed = (command.speed - low) / (high - low) * 2 - 1
+        return jnp.clip(jnp.stack([speed, command.steering / self.steering_limit], -1), -1.0, 1.0)
+
+
+@struct.dataclass(kw_only=True)
+class NavigationState(environment.EnvState):
+    """One episode under way.
+
+    vehicle, history: the model's.
+    world: `[]` int32; goal: `[3]` m.
+    action: `[2]` the last one, in [-1, 1].
+    time: `[]` int32 steps done; stalled: `[]` int32 steps stalled without a break.
+    ending: `[]` int32 `Ending` code.
+    """
+
+    vehicle: VehicleState
+    history: History
+    world: jax.Array
+    goal: jax.Array
+    action: jax.Array
+    stalled: jax.Array
+    ending: jax.Array
+
+
+@struct.dataclass(kw_only=True)
+class NavigationParams(environment.EnvParams):
+    """What an environment is run with: arrays, so that nothing here is compiled in.
+
+    dynamics: the model's parameters.
+    terrain: all worlds.
+    starts, start_observation: leaves `[P, ...]` and `[P, O]`, the pool that resets draw from.
+    max_steps_in_episode: `[]` int32.
+    """
+
+    dynamics: Params
+    terrain: TerrainMap
+    starts: NavigationState
+    start_observation: jax.Array
+
+    @property
+    def pool_size(self) -> int:
+        """P, the number of starts."""
+        return self.start_observation.shape[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
+    """Drives to a goal with actions in [-1, 1]^2, speed and steering, at 10 Hz.
+
+    Two environments of equal `dynamics` and `config` are equal and share compiled code. There
+    are no default parameters: a ground must be chosen, see `make_params`.
+    """
+
+    dynamics: Dynamics
+    config: NavigationConfig = dataclasses.field(default_factory=NavigationConfig)
+
+    def __post_init__(self) -> None:
+        chassis = self.config.chassis
+        reach = float(np.hypot(chassis.wheelbase, chassis.track)) / 2
+        top_speed = max(abs(speed) for speed in self.config.speed_range)
+        query.footprint_covered(reach, top_speed)
+
+    def make_params(self, dynamics: Params, terrain: TerrainMap, tasks: Tasks) -> NavigationParams:
+        """Parameters whose pool of starts is `tasks`, each settled on the ground by the model.
+
+        `ValueError` names the first task that cannot be driven, or whose settled state is not
+        finite.
+        """
+        return _make_params(self, dynamics, terrain, tasks)
+
+    def start(
+        self, params: NavigationParams, index: jax.Array
+    ) -> tuple[jax.Array, NavigationState]:
+        """Observation and state of start `[]` of the pool."""
+        return jax.tree.map(lambda x: x[index], (params.start_observation, params.starts))
+
+    def reset_env(
+        self, key: jax.Array, params: NavigationParams
+    ) -> tuple[jax.Array, NavigationState]:
+        """A start drawn evenly from the pool."""
+        return self.start(params, jax.random.randint(key, (), 0, params.pool_size))
+
+    def step_env(
+        self,
+        key: jax.Array,
+        state: NavigationState,
+        action: int | float | jax.Array,
+        params: NavigationParams,
+    ) -> tuple[jax.Array, NavigationState, jax.Array, jax.Array, dict[Any, Any]]:
+        """One step of 0.1 s; a state that diverged is replaced by the last plausible one."""
+        config = self.config
+        terrain = params.terrain.select(state.world)
+        action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
+        moved = self.dynamics.step(
+            params.dynamics, terrain, state.history, state.vehicle, config.command(action)
+        )
+        plausible = self._is_plausible(terrain, moved[0])
+        vehicle, history, action = jax.tree.map(
+            lambda new, old: jnp.where(plausible, new, old),
+            (*moved, action),
+            (state.vehicle, state.history, state.action),
+        )
+
+        speed = jnp.linalg.norm(vehicle.velocity[:2])
+        is_stalled = speed < config.stalled_speed
+        stalled = jnp.where(is_stalled, state.stalled + 1, 0)
+        time = jnp.int32(state.time) + 1
+        before, _ = observation.distance_and_bearing(state.vehicle.position, state.goal)
+        distance, _ = observation.distance_and_bearing(vehicle.position, state.goal)
+        roll, pitch, yaw = vehicle.rpy
+        xy = vehicle.position[:2]
+        chassis = config.chassis
+        ending = first_ending(
+            {
+                Ending.TIMED_OUT: time >= params.max_steps_in_episode,
+                Ending.GOAL: distance < config.goal_radius,
+                Ending.STUCK: stalled * STEP_SECONDS >= config.stuck_seconds,
+                Ending.COLLIDED: obstacles.collides(
+                    terrain, xy, yaw, chassis.length, chassis.width
+                ),
+                Ending.OFF_MAP: edge_distance(terrain, xy) < config.map_margin,
+                Ending.ROLLED_OVER: jnp.maximum(jnp.abs(roll), jnp.abs(pitch))
+                > config.rollover_angle,
+                Ending.DIVERGED: ~plausible,
+            }
+        )
+        climb = vehicle.position[2] - state.vehicle.position[2]
+        gain = reward(
+            config.reward,
+            progress=before - distance,
+            distance=distance,
+            stalled=is_stalled,
+            roll=roll,
+            pitch=pitch,
+            vertical_speed=climb / STEP_SECONDS,
+            ending=ending,
+        )
+        new = dataclasses.replace(
+            state,
+            vehicle=vehicle,
+            history=history,
+            action=action,
+            time=time,
+            stalled=stalled,
+            ending=ending,
+        )
+        info = {
+            "ending": ending,
+            "abs_roll": jnp.abs(roll),
+            "abs_pitch": jnp.abs(pitch),
+            "distance": distance,
+        }
+        return self.observe(key, new, action, params), new, gain, is_terminal(ending), info
+
+    def observe(
+        self,
+        key: jax.Array | None,
+        state: NavigationState,
+        action: int | float | jax.Array | None,
+        params: NavigationParams,
+    ) -> jax.Array:
+        """`[O]` float32, see `observation.observe`."""
+        del key, action
+        terrain = params.terrain.select(state.world)
+        return observation.observe(terrain, state.vehicle, state.goal, state.action)
+
+    def is_terminated(self, state: NavigationState, params: NavigationParams) -> jax.Array:
+        """Whether the task itself is over."""
+        return is_terminal(state.ending)
+
+    def is_truncated(self, state: NavigationState, params: NavigationParams) -> jax.Array:
+        """Whether only the time is over: the value of the state that follows still counts."""
+        return state.ending == Ending.TIMED_OUT
+
+    @property
+    def num_actions(self) -> int:
+        """Speed and steering."""
+        return 2
+
+    def action_space(self, params: NavigationParams | None = None) -> spaces.Box:
+        """[-1, 1]^2."""
+        return spaces.Box(-1.0, 1.0, (2,), jnp.float32)
+
+    def observation_space(self, params: NavigationParams | None = None) -> spaces.Box:
+        """Every entry within the observation's limit."""
+        limit = observation.OBSERVATION_LIMIT
+        return spaces.Box(-limit, limit, (observation.OBSERVATION_SIZE,), jnp.float32)
+
+    def _is_plausible(self, terrain: TerrainMap, vehicle: VehicleState) -> jax.Array:
+        off_ground = vehicle.position[2] - query.height(terrain, vehicle.position[:2])
+        return (
+            jnp.all(jnp.isfinite(vehicle.vector))
+            & (jnp.linalg.norm(vehicle.velocity) <= self.config.plausible_speed)
+            & (jnp.abs(off_ground) <= self.config.plausible_height)
+        )
+
+
+def _make_params(
+    env: NavigationEnv, dynamics: Params, terrain: TerrainMap, pool: Tasks
+) -> NavigationParams:
+    config = env.config
+    pool = tasks.validate(pool, terrain, config.goal_radius, config.map_margin)
+    starts, start_observation = _settle(env, dynamics, terrain, pool)
+    finite = np.all(np.isfinite(starts.vehicle.vector), axis=-1)
+    if not finite.all():
+        i = int(np.argmin(finite))
+        raise ValueError(
+            f"dynamics: expected a finite state after {config.settle_steps} steps of standing "
+            f"still, found {np.asarray(starts.vehicle.vector)[i]} in task {i} (world "
+            f"{int(pool.world[i])}, start {np.asarray(pool.start)[i].tolist()}); "
+            f"{np.sum(~finite)} of {finite.size} tasks are so"
+        )
+    return NavigationParams(
+        max_steps_in_episode=jnp.int32(round(config.horizon_seconds / STEP_SECONDS)),
+        dynamics=dynamics,
+        terrain=terrain,
+        starts=starts,
+        start_observation=start_observation,
+    )
+
+
+@partial(jax.jit, static_argnames="env")
+def _settle(
+    env: NavigationEnv, dynamics: Params, terrain: TerrainMap, pool: Tasks
+) -> tuple[NavigationState, jax.Array]:
+    """States and observations of vehicles at rest: leaves `[P, ...]`, `[P, O]`."""
+    standing = Command(jnp.float32(0), jnp.float32(0))
+    action = env.config.action(standing)
+
+    def settle(task: Tasks) -> tuple[NavigationState, jax.Array]:
+        selected = terrain.select(task.world)
+        vehicle = tasks.place(selected, env.config.chassis, task.start, task.yaw)
+        goal = jnp.append(task.goal, query.height(selected, task.goal))
+
+        def advance(
+            carry: tuple[VehicleState, History], _: None
+        ) -> tuple[tuple[VehicleState, History], None]:
+            vehicle, history = carry
+            return env.dynamics.step(dynamics, selected, history, vehicle, standing), None
+
+        carry = vehicle, env.dynamics.init(dynamics, selected, vehicle)
+        (vehicle, history), _ = jax.lax.scan(advance, carry, length=env.config.settle_steps)
+        zero = jnp.int32(0)
+        state = NavigationState(
+            time=zero,
+            vehicle=vehicle,
+            history=history,
+            world=task.world,
+            goal=goal,
+            action=action,
+            stalled=zero,
+            ending=zero,
+        )
+        return state, observation.observe(selected, vehicle, goal, action)
+
+    return jax.vmap(settle)(pool)

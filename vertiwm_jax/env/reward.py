@@ -1,0 +1,74 @@
+"""The reward of goal navigation: progress, less discomfort and standing still, and the ending."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+
+from vertiwm_jax.env.termination import Ending
+
+
+@dataclasses.dataclass(frozen=True)
+class RewardConfig:
+    """Weights in Verti-Bench's shape; all are gains, penalties are subtracted.
+
+    progress: for each metre that the goal comes nearer.
+    stalled: for each step spent standing.
+    tilt: for roll and for pitch beyond `tilt_limit`.
+    tilt_limit: rad.
+    vertical: for each m/s of vertical speed, each step.
+    goal, stuck, failure: once, at the ending; failure is any other terminal ending.
+    timed_out, timed_out_distance: once, and for each metre that is left then.
+    """
+
+    progress: float = 50.0
+    stalled: float = 10.0
+    tilt: float = 20.0
+    tilt_limit: float = math.radians(30)
+    vertical: float = 1.0
+    goal: float = 3000.0
+    stuck: float = 300.0
+    failure: float = 600.0
+    timed_out: float = 100.0
+    timed_out_distance: float = 10.0
+
+
+def reward(
+    config: RewardConfig,
+    *,
+    progress: jax.Array,
+    distance: jax.Array,
+    stalled: jax.Array,
+    roll: jax.Array,
+    pitch: jax.Array,
+    vertical_speed: jax.Array,
+    ending: jax.Array,
+) -> jax.Array:
+    """`[...]` reward of one 0.1 s step.
+
+    progress: m that the goal came nearer; distance: m left; stalled: bool; roll, pitch: rad;
+    vertical_speed: m/s in the world frame; ending: `Ending` codes.
+    """
+
+    def tilt_penalty(angle: jax.Array) -> jax.Array:
+        size = jnp.abs(angle)
+        return size / config.tilt_limit * jnp.maximum(size - config.tilt_limit, 0.0)
+
+    terminal = {
+        Ending.TIMED_OUT: -config.timed_out - config.timed_out_distance * distance,
+        Ending.GOAL: config.goal,
+        Ending.STUCK: -config.stuck,
+    }
+    at_end = jnp.select(
+        [ending == Ending.RUNNING, *(ending == code for code in terminal)],
+        [0.0, *terminal.values()],
+        -config.failure,
+    )
+    return (
+        config.progress * progress
+        - config.stalled * stalled
+        - config.tilt * (tilt_penalty(roll) + tilt_penalty(pitch))
+        - config.vertical * jnp.abs(vertical_speed)
+        + at_end
+    )

@@ -1,0 +1,194 @@
+"""Navigation tasks: where a vehicle starts, which way it looks, and where it must go."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from vertiwm_jax.env.termination import edge_distance
+from vertiwm_jax.mechanics.kinematic import rest_on_ground
+from vertiwm_jax.state import VehicleState
+from vertiwm_jax.terrain import obstacles
+from vertiwm_jax.terrain.map import TerrainMap
+
+
+@struct.dataclass
+class Tasks:
+    """P tasks on W stacked worlds.
+
+    world: `[P]` int32.
+    start: `[P, 2]` x, y, m.
+    yaw: `[P]` rad.
+    goal: `[P, 2]` x, y, m.
+    """
+
+    world: jax.Array
+    start: jax.Array
+    yaw: jax.Array
+    goal: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Chassis:
+    """What an environment must know of the vehicle's shape, m; the HMMWV by default.
+
+    length, width: the rectangle that must stay clear of obstacles.
+    wheelbase, track: where the wheels touch the ground.
+    axle_height: of the body origin above level ground.
+    """
+
+    length: float = 4.6
+    width: float = 2.2
+    wheelbase: float = 3.378
+    track: float = 1.82
+    axle_height: float = 0.47
+
+
+@dataclasses.dataclass(frozen=True)
+class RandomTaskConfig:
+    """Which random tasks are accepted.
+
+    distance: m, least and most from start to goal.
+    heading_error: rad, the start looks at most this far off the goal.
+    steepest_start: rad, of the ground under the wheels.
+    clearance: m that start and goal keep from obstacles and `margin` m from the map's edge.
+    candidates: drawn for each task; the first acceptable one is taken.
+    """
+
+    distance: tuple[float, float] = (20.0, 115.0)
+    heading_error: float = math.pi / 3
+    steepest_start: float = math.radians(20)
+    clearance: float = 1.0
+    margin: float = 4.0
+    candidates: int = 128
+
+
+def circle_tasks(terrain: TerrainMap, radius: float = 60.0, pairs: int = 10) -> Tasks:
+    """Verti-Bench's geometry: W x `pairs` tasks across a circle, world after world.
+
+    Starts are evenly spaced on a circle about the middle of the map, each goal lies opposite,
+    and the vehicle looks at it. `ValueError` if the circle does not fit on the map.
+    """
+    rows, columns = terrain.elevation.shape[-2:]
+    half = np.array([columns - 1, rows - 1]) * float(terrain.resolution) / 2
+    if radius >= half.min():
+        raise ValueError(
+            f"circle_tasks: radius {radius:g} m does not fit on a map of "
+            f"{2 * half[0]:g} x {2 * half[1]:g} m; choose one below {half.min():g} m"
+        )
+    middle = np.asarray(terrain.origin) + half * [1, -1]
+    angle = 2 * np.pi * np.arange(pairs) / pairs
+    offset = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    worlds = terrain.worlds
+    return Tasks(
+        world=jnp.repeat(jnp.arange(worlds, dtype=jnp.int32), pairs),
+        start=jnp.asarray(np.tile(middle + offset, (worlds, 1)), jnp.float32),
+        yaw=jnp.asarray(np.tile(angle - np.pi, worlds), jnp.float32),
+        goal=jnp.asarray(np.tile(middle - offset, (worlds, 1)), jnp.float32),
+    )
+
+
+def random_tasks(
+    key: jax.Array,
+    terrain: TerrainMap,
+    count: int,
+    chassis: Chassis,
+    config: RandomTaskConfig = RandomTaskConfig(),
+) -> Tasks:
+    """`count` random tasks, spread evenly over the worlds.
+
+    `ValueError` if for some task no candidate was acceptable.
+    """
+    tasks, found = _draw(key, terrain, count, chassis, config)
+    missing = int(count - found.sum())
+    if missing:
+        worlds = np.unique(np.asarray(tasks.world)[~np.asarray(found)])
+        raise ValueError(
+            f"random_tasks: no acceptable start and goal among {config.candidates} candidates "
+            f"for {missing} of {count} tasks, on worlds {worlds[:8].tolist()}; allow a steeper "
+            "start, a shorter distance, less clearance or more candidates"
+        )
+    return tasks
+
+
+@jax.jit(static_argnames=("count", "chassis", "config"))
+def _draw(
+    key: jax.Array, terrain: TerrainMap, count: int, chassis: Chassis, config: RandomTaskConfig
+) -> tuple[Tasks, jax.Array]:
+    rows, columns = terrain.elevation.shape[-2:]
+    extent = jnp.array([columns - 1, rows - 1]) * terrain.resolution
+    corner = terrain.origin - jnp.array([0.0, 1.0]) * extent
+    low, high = corner + config.margin, corner + extent - config.margin
+
+    def draw(key: jax.Array, world: jax.Array) -> tuple[Tasks, jax.Array]:
+        selected = terrain.select(world)
+        shape = (config.candidates, 2)
+        key_start, key_goal, key_yaw = jax.random.split(key, 3)
+        start = jax.random.uniform(key_start, shape, minval=low, maxval=high)
+        goal = jax.random.uniform(key_goal, shape, minval=low, maxval=high)
+        offset = goal - start
+        yaw = jnp.arctan2(offset[:, 1], offset[:, 0]) + jax.random.uniform(
+            key_yaw, shape[:1], minval=-config.heading_error, maxval=config.heading_error
+        )
+        distance = jnp.linalg.norm(offset, axis=-1)
+        rpy = jax.vmap(lambda xy, yaw: place(selected, chassis, xy, yaw).rpy)(start, yaw)
+        tilt = jnp.arccos(jnp.cos(rpy[:, 0]) * jnp.cos(rpy[:, 1]))
+        length = chassis.length + 2 * config.clearance
+        width = chassis.width + 2 * config.clearance
+
+        def blocked(xy: jax.Array) -> jax.Array:
+            return jax.vmap(lambda xy, yaw: obstacles.collides(selected, xy, yaw, length, width))(
+                xy, yaw
+            )
+
+        acceptable = (
+            (distance >= config.distance[0])
+            & (distance <= config.distance[1])
+            & (tilt <= config.steepest_start)
+            & ~blocked(start)
+            & ~blocked(goal)
+        )
+        first = jnp.argmax(acceptable)
+        return Tasks(world, start[first], yaw[first], goal[first]), acceptable[first]
+
+    world = jnp.arange(count, dtype=jnp.int32) % terrain.worlds
+    return jax.vmap(draw)(jax.random.split(key, count), world)
+
+
+def place(terrain: TerrainMap, chassis: Chassis, xy: jax.Array, yaw: jax.Array) -> VehicleState:
+    """A vehicle standing at `[2]` xy and `[]` yaw, laid on the ground under its four wheels."""
+    sizes = (chassis.wheelbase, chassis.track, chassis.axle_height)
+    position, rpy = rest_on_ground(terrain, xy, yaw, *map(jnp.float32, sizes))
+    still = jnp.zeros(3)
+    return VehicleState(position, rpy, still, still)
+
+
+def validate(tasks: Tasks, terrain: TerrainMap, goal_radius: float, margin: float) -> Tasks:
+    """The same tasks; `ValueError` names the first that cannot be driven.
+
+    Starts must lie `margin` m inside the map and farther than `goal_radius` m from the goal.
+    """
+    world = np.asarray(tasks.world)
+    start_edge = np.asarray(edge_distance(terrain, tasks.start))
+    goal_edge = np.asarray(edge_distance(terrain, tasks.goal))
+    distance = np.linalg.norm(np.asarray(tasks.goal - tasks.start), axis=-1)
+    # Negated, so that NaN fails.
+    checks = {
+        f"world: expected 0 to {terrain.worlds - 1}": ~((world >= 0) & (world < terrain.worlds)),
+        f"start: expected at least {margin:g} m inside the map": ~(start_edge >= margin),
+        "goal: expected inside the map": ~(goal_edge >= 0),
+        f"goal: expected farther than {goal_radius:g} m from the start": ~(distance > goal_radius),
+        "yaw: expected a finite angle": ~np.isfinite(np.asarray(tasks.yaw)),
+    }
+    for message, bad in checks.items():
+        if bad.any():
+            i = int(np.argmax(bad))
+            raise ValueError(
+                f"tasks.{message}; task {i} has world {world[i]}, "
+                f"start {np.asarray(tasks.start)[i].tolist()}, "
+                f"goal {np.asarray(tasks.goal)[i].tolist()}, yaw {float(tasks.yaw[i]):g}"
+            )
+    return tasks

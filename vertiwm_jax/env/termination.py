@@ -1,0 +1,49 @@
+"""How an episode ends."""
+
+import enum
+
+import jax
+import jax.numpy as jnp
+
+from vertiwm_jax.terrain.map import TerrainMap
+
+
+class Ending(enum.IntEnum):
+    """Why an episode is over; a time-out truncates, all after it terminate."""
+
+    RUNNING = 0
+    TIMED_OUT = 1
+    GOAL = 2
+    STUCK = 3
+    COLLIDED = 4
+    OFF_MAP = 5
+    ROLLED_OVER = 6
+    DIVERGED = 7
+
+
+def first_ending(conditions: dict[Ending, jax.Array]) -> jax.Array:
+    """`[...]` int32 code of the gravest condition that holds, `RUNNING` if none does.
+
+    Gravest is the largest code: a vehicle that reaches the goal upside down has rolled over.
+    """
+    order = sorted(conditions, reverse=True)
+    return jnp.select(
+        [conditions[ending] for ending in order],
+        [jnp.int32(ending) for ending in order],
+        jnp.int32(Ending.RUNNING),
+    )
+
+
+def is_terminal(ending: jax.Array) -> jax.Array:
+    """`[...]` whether the code ends the task itself and not only its time."""
+    return ending > Ending.TIMED_OUT
+
+
+def edge_distance(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
+    """`[..., 2]` points to `[...]` m from the nearest edge of the map, negative outside."""
+    rows, columns = terrain.elevation.shape[-2:]
+    size = jnp.array([columns - 1, rows - 1]) * terrain.resolution
+    north_west = terrain.origin
+    # Down from the northern edge, right from the western one.
+    inward = (xy - north_west) * jnp.array([1.0, -1.0])
+    return jnp.min(jnp.minimum(inward, size - inward), axis=-1)

@@ -1,0 +1,223 @@
+"""How well a policy drives: success, time, roll and pitch over a set of tasks."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from functools import partial
+from typing import Protocol, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
+from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.state import STEP_SECONDS
+
+
+class Policy(Protocol):
+    """`[O]` observation and a key to a `[2]` action in [-1, 1].
+
+    A pytree that can be called: what it has learned are leaves, so that other weights of the
+    same shapes do not compile again.
+    """
+
+    def __call__(self, observation: jax.Array, key: jax.Array) -> jax.Array: ...
+
+
+@struct.dataclass
+class NavigationResult:
+    """P episodes, one for each task of the pool.
+
+    ending: `[P]` int32 `Ending` codes.
+    steps: `[P]` int32, of 0.1 s.
+    abs_roll, abs_pitch: `[P]` rad, mean over the steps of an episode.
+    driven: `[P]` m along the path.
+    final_distance: `[P]` m left to the goal.
+    world: `[P]` int32; goal: `[P, 3]` m.
+    position, rpy: `[P, T + 1, 3]` m and rad, from the start on; after the end, the last ones.
+    """
+
+    ending: jax.Array
+    steps: jax.Array
+    abs_roll: jax.Array
+    abs_pitch: jax.Array
+    driven: jax.Array
+    final_distance: jax.Array
+    world: jax.Array
+    goal: jax.Array
+    position: jax.Array
+    rpy: jax.Array
+
+    @property
+    def success(self) -> jax.Array:
+        """`[P]` whether the goal was reached."""
+        return self.ending == Ending.GOAL
+
+    @property
+    def seconds(self) -> jax.Array:
+        """`[P]` duration, s."""
+        return self.steps * STEP_SECONDS
+
+    def path(self, episode: int) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and roll, pitch, yaw of one episode, `[steps + 1, 3]` each."""
+        end = int(self.steps[episode]) + 1
+        return np.asarray(self.position[episode, :end]), np.asarray(self.rpy[episode, :end])
+
+
+def evaluate(
+    env: NavigationEnv, params: NavigationParams, policy: Policy, key: jax.Array
+) -> NavigationResult:
+    """Drives every task of the pool once, all at the same time, as one compiled program.
+
+    The program ends when the last episode does.
+    """
+    return _evaluate(env, int(params.max_steps_in_episode), params, policy, key)
+
+
+@partial(jax.jit, static_argnames=("env", "length"))
+def _evaluate(
+    env: NavigationEnv, length: int, params: NavigationParams, policy: Policy, key: jax.Array
+) -> NavigationResult:
+    count = params.pool_size
+    observation, start = jax.vmap(env.start, (None, 0))(params, jnp.arange(count))
+
+    def position_and_rpy(state: NavigationState) -> tuple[jax.Array, jax.Array]:
+        return state.vehicle.position, state.vehicle.rpy
+
+    paths = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (length + 1, *x.shape)), position_and_rpy(start)
+    )
+
+    @jax.vmap
+    def drive(
+        observation: jax.Array, state: NavigationState, key: jax.Array
+    ) -> tuple[jax.Array, NavigationState]:
+        key_policy, key_step = jax.random.split(key)
+        action = policy(observation, key_policy)
+        new_observation, new_state, *_ = env.step_env(key_step, state, action, params)
+        over = state.ending != Ending.RUNNING
+        return jax.tree.map(
+            lambda old, new: jnp.where(over, old, new),
+            (observation, state),
+            (new_observation, new_state),
+        )
+
+    def unfinished(carry: tuple) -> jax.Array:
+        step, _, state, _ = carry
+        return (step < length) & jnp.any(state.ending == Ending.RUNNING)
+
+    def advance(carry: tuple) -> tuple:
+        step, observation, state, paths = carry
+        keys = jax.random.split(jax.random.fold_in(key, step), count)
+        observation, state = drive(observation, state, keys)
+        step = step + 1
+        paths = jax.tree.map(lambda path, x: path.at[step].set(x), paths, position_and_rpy(state))
+        return step, observation, state, paths
+
+    last, _, end, paths = jax.lax.while_loop(
+        unfinished, advance, (jnp.int32(0), observation, start, paths)
+    )
+    after = (jnp.arange(length + 1) > last)[:, None, None]
+    position, rpy = jax.tree.map(
+        lambda path, x: jnp.where(after, x, path), paths, position_and_rpy(end)
+    )
+    steps = jnp.asarray(end.time)
+    # Row 0 is the start, which no step led to.
+    counted = (jnp.arange(length)[:, None] < steps)[..., None]
+    mean_tilt = jnp.sum(jnp.abs(rpy[1:]) * counted, axis=0) / jnp.maximum(steps, 1)[:, None]
+    return NavigationResult(
+        ending=end.ending,
+        steps=steps,
+        abs_roll=mean_tilt[:, 0],
+        abs_pitch=mean_tilt[:, 1],
+        driven=jnp.sum(jnp.linalg.norm(jnp.diff(position, axis=0), axis=-1), axis=0),
+        final_distance=jnp.linalg.norm(end.goal - end.vehicle.position, axis=-1),
+        world=end.world,
+        goal=end.goal,
+        position=jnp.swapaxes(position, 0, 1),
+        rpy=jnp.swapaxes(rpy, 0, 1),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """One row of a table of policies.
+
+    tasks, successes: counts; success_interval: 95 % Wilson interval of the rate.
+    seconds, seconds_deviation: mean and standard deviation over successes; NaN without any.
+    abs_roll, abs_pitch: rad, mean over all steps of all episodes.
+    driven: m, mean over all episodes.
+    endings: how often each ending came, by name.
+    """
+
+    tasks: int
+    successes: int
+    success_interval: tuple[float, float]
+    seconds: float
+    seconds_deviation: float
+    abs_roll: float
+    abs_pitch: float
+    driven: float
+    endings: Mapping[str, int]
+
+    @classmethod
+    def of(cls, result: NavigationResult) -> Self:
+        """The summary of some episodes."""
+        success = np.asarray(result.success)
+        steps = np.asarray(result.steps)
+        seconds = np.asarray(result.seconds)[success]
+        counts = np.bincount(np.asarray(result.ending), minlength=len(Ending))
+        return cls(
+            tasks=len(success),
+            successes=int(success.sum()),
+            success_interval=wilson_interval(int(success.sum()), len(success)),
+            seconds=float(seconds.mean()) if len(seconds) else math.nan,
+            seconds_deviation=float(seconds.std()) if len(seconds) else math.nan,
+            abs_roll=float(np.average(result.abs_roll, weights=steps)),
+            abs_pitch=float(np.average(result.abs_pitch, weights=steps)),
+            driven=float(np.mean(result.driven)),
+            endings={e.name.lower(): int(counts[e]) for e in Ending if counts[e]},
+        )
+
+
+def wilson_interval(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
+    """Wilson's score interval of a success rate, 95 % by default.
+
+    Wilson (1927), Probable inference, the law of succession, and statistical inference.
+    """
+    rate = successes / trials
+    middle = rate + z * z / (2 * trials)
+    half = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
+    scale = 1 + z * z / trials
+    return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
+
+
+def format_table(rows: Mapping[str, Summary]) -> str:
+    """A Markdown table with the paper's columns, one row for each named policy."""
+    header = ["policy", "success", "95 %", "time [s]", "roll [deg]", "pitch [deg]", "driven [m]"]
+    cells: list[tuple[str, ...]] = [(*header, "endings")]
+    for name, row in rows.items():
+        low, high = (round(100 * bound) for bound in row.success_interval)
+        time = f"{row.seconds:.1f} ± {row.seconds_deviation:.1f}" if row.successes else "-"
+        endings = ", ".join(f"{ending} {count}" for ending, count in row.endings.items())
+        cells.append(
+            (
+                name,
+                f"{row.successes}/{row.tasks}",
+                f"{low}-{high}",
+                time,
+                f"{math.degrees(row.abs_roll):.2f}",
+                f"{math.degrees(row.abs_pitch):.2f}",
+                f"{row.driven:.1f}",
+                endings,
+            )
+        )
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    cells.insert(1, tuple("-" * width for width in widths))
+    lines = (
+        " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        for row in cells
+    )
+    return "\n".join(f"| {line} |" for line in lines)

@@ -1,0 +1,136 @@
+"""Pictures of drives and of learning, in one style that survives print and colour blindness."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vertiwm_jax.env import picture
+from vertiwm_jax.terrain.map import TerrainMap
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito (2008), without the yellow that vanishes on paper; dashes tell the rest.
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+_DASHES = ("-", "--", "-.", ":")
+_STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "0.88",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4,
+    "legend.frameon": False,
+    "savefig.dpi": 160,
+}
+
+
+def trajectories(
+    terrain: TerrainMap,
+    world: int,
+    drives: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    goal: np.ndarray,
+    goal_radius: float,
+    step_seconds: float,
+) -> Figure:
+    """Drives over the shaded map of one world, with roll and pitch over time beside it.
+
+    drives: by name, positions `[T, 3]` m and roll, pitch, yaw `[T, 3]` rad, all to the one goal
+    `[2 or 3]`. The caller saves and owns the figure; no window is opened.
+    """
+    with _style():
+        figure = _figure(9.0, 4.6)
+        grid = figure.add_gridspec(2, 2, width_ratios=(1.1, 1))
+        overhead = figure.add_subplot(grid[:, 0])
+        roll = figure.add_subplot(grid[0, 1])
+        pitch = figure.add_subplot(grid[1, 1], sharex=roll)
+        _draw_map(overhead, terrain, world)
+        overhead.add_patch(_circle(goal, goal_radius))
+        overhead.plot(goal[0], goal[1], "*", color="black", markersize=9, markeredgecolor="white")
+        for i, (name, (position, rpy)) in enumerate(drives.items()):
+            colour, dash = _line(i)
+            x, y = position[:, 0], position[:, 1]
+            overhead.plot(x, y, color="white", linewidth=3.2, alpha=0.8)
+            overhead.plot(x, y, dash, label=name, linewidth=1.8, color=colour)
+            overhead.plot(x[0], y[0], "o", color="black", markersize=5, markeredgecolor="white")
+            overhead.plot(x[-1], y[-1], "s", color=colour, markersize=5)
+            seconds = step_seconds * np.arange(len(rpy))
+            for axes, angle in ((roll, rpy[:, 0]), (pitch, rpy[:, 1])):
+                axes.plot(seconds, np.degrees(angle), dash, color=colour)
+        roll.set_ylabel("roll [deg], left side up")
+        pitch.set_ylabel("pitch [deg], nose down")
+        pitch.set_xlabel("time [s]")
+        roll.tick_params(labelbottom=False)
+        figure.legend(*overhead.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    return figure
+
+
+def learning_curves(
+    metrics: Mapping[str, Mapping[str, Sequence[float]]],
+    x: str,
+    labels: Mapping[str, str],
+    x_label: str,
+) -> Figure:
+    """One panel for each of `labels`, metric name to axis label, one line for each run.
+
+    metrics: by run, columns of numbers of equal length by metric name. `x` names the column of
+    the horizontal axis. Gaps (NaN) are left open.
+    """
+    with _style():
+        columns = math.ceil(math.sqrt(len(labels)))
+        rows = math.ceil(len(labels) / columns)
+        figure = _figure(3.2 * columns, 2.5 * rows + 0.3)
+        panels = figure.subplots(rows, columns, squeeze=False, sharex=True)
+        for axes, (metric, label) in zip(panels.flat, labels.items(), strict=False):
+            for i, (run, table) in enumerate(metrics.items()):
+                colour, dash = _line(i)
+                axes.plot(table[x], table[metric], dash, label=run, color=colour)
+            axes.set_ylabel(label)
+        for axes in panels.flat[len(labels) :]:
+            axes.set_axis_off()
+        for axes in panels.flat[max(0, len(labels) - columns) : len(labels)]:
+            axes.set_xlabel(x_label)
+            axes.tick_params(labelbottom=True)
+        if len(metrics) > 1:
+            handles = panels.flat[0].get_legend_handles_labels()
+            figure.legend(*handles, loc="outside upper center", ncols=4)
+    return figure
+
+
+def _line(i: int) -> tuple[str, str]:
+    """Colour and dash of the i-th line."""
+    return _COLOURS[i % len(_COLOURS)], _DASHES[i % len(_DASHES)]
+
+
+def _draw_map(axes: Axes, terrain: TerrainMap, world: int) -> None:
+    axes.imshow(picture.shaded(terrain, world), extent=picture.extent(terrain))
+    axes.grid(False)
+    axes.set_xlabel("x [m], east")
+    axes.set_ylabel("y [m], north")
+
+
+def _circle(centre: np.ndarray, radius: float):
+    from matplotlib.patches import Circle
+
+    return Circle((centre[0], centre[1]), radius, fill=False, color="black", linewidth=1.2)
+
+
+# Imported when the first picture is drawn: training should not wait for matplotlib.
+def _style():
+    import matplotlib
+
+    return matplotlib.rc_context(_STYLE)
+
+
+def _figure(width: float, height: float) -> Figure:
+    from matplotlib.figure import Figure
+
+    # Not made by pyplot: belongs to no window and is freed with its last reference.
+    return Figure(figsize=(width, height), layout="constrained")

@@ -1,0 +1,60 @@
+"""The closing table: policies side by side, by difficulty of the ground."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from vertiwm_jax.evaluation.navigation import NavigationResult, Summary, format_table
+
+Results = Mapping[str, NavigationResult]
+
+
+def by_difficulty(results: Results, difficulty: Sequence[str]) -> dict[str, Results]:
+    """Splits the episodes of each policy by the `difficulty` `[W]` of their world."""
+    groups = {}
+    for name in dict.fromkeys(difficulty):
+        worlds = [world for world, found in enumerate(difficulty) if found == name]
+        groups[name] = {
+            policy: jax.tree.map(lambda x, rows=np.isin(result.world, worlds): x[rows], result)
+            for policy, result in results.items()
+        }
+    return groups
+
+
+def markdown(groups: Mapping[str, Results], reference: str) -> str:
+    """A table for each group, and how many tasks that `reference` fails the others solve."""
+    return "\n\n".join(_section(name, results, reference) for name, results in groups.items())
+
+
+def summary(groups: Mapping[str, Results], reference: str) -> dict[str, Any]:
+    """The same as plain numbers, for JSON."""
+    return {
+        name: {
+            policy: {
+                **dataclasses.asdict(Summary.of(result)),
+                "solved_of_reference_failures": _rescued(result, results[reference]),
+            }
+            for policy, result in results.items()
+        }
+        for name, results in groups.items()
+    }
+
+
+def _section(name: str, results: Results, reference: str) -> str:
+    table = format_table({policy: Summary.of(result) for policy, result in results.items()})
+    failures = int(np.sum(~np.asarray(results[reference].success)))
+    rescued = ", ".join(
+        f"{policy} {_rescued(result, results[reference])}"
+        for policy, result in results.items()
+        if policy != reference
+    )
+    return (
+        f"**{name}**\n\n{table}\n\nSolved of the {failures} tasks that {reference} fails: {rescued}"
+    )
+
+
+def _rescued(result: NavigationResult, reference: NavigationResult) -> int:
+    return int(np.sum(np.asarray(result.success) & ~np.asarray(reference.success)))

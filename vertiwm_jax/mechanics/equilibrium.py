@@ -1,0 +1,64 @@
+"""Where the soil carries the load: equilibrium sinkage, and Bekker's closed form."""
+
+import jax
+import jax.numpy as jnp
+
+from vertiwm_jax.mechanics.wheel import MAX_SINKAGE, Contact, Scalar, Wheel, forces
+from vertiwm_jax.terrain.soil import Soil
+
+_BISECTIONS = 26  # of 1.5 radii: past the last bit of float32
+
+
+def equilibrium_sinkage(
+    wheel: Wheel,
+    soil: Soil,
+    contact: Contact,
+    load: Scalar,
+    velocity_x: Scalar,
+    velocity_y: Scalar,
+    omega: Scalar,
+    rut: Scalar = 0.0,
+    nodes: int = 8,
+) -> jax.Array:
+    """Sinkage in m at which the normal force equals `load` in N, all `[...]`.
+
+    The floor of the rut (zero on undisturbed soil) without load; `MAX_SINKAGE` radii below the
+    bottom of the rut where the soil cannot carry it. Differentiable in both modes by the
+    implicit-function theorem; the gradient is zero at both ends.
+    """
+
+    def unbalanced(sinkage: jax.Array) -> jax.Array:
+        wrench = forces(
+            wheel, soil, contact, sinkage, velocity_x, velocity_y, omega, rut, nodes
+        )
+        return wrench.normal - load
+
+    def bisect(residual, low: jax.Array) -> jax.Array:
+        def halve(_, bracket: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            low, high = bracket
+            middle = (low + high) / 2
+            carried = residual(middle) >= 0
+            return jnp.where(carried, low, middle), jnp.where(carried, middle, high)
+
+        high = low + rut + MAX_SINKAGE * wheel.radius
+        low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, (low, high))
+        return high
+
+    def divide(linear, right: jax.Array) -> jax.Array:
+        slope = linear(jnp.ones_like(right))
+        stiff = slope > 0
+        return jnp.where(stiff, right / jnp.where(stiff, slope, 1.0), 0.0)
+
+    start = jnp.zeros_like(unbalanced(jnp.zeros(())))
+    return jax.lax.custom_root(unbalanced, start, bisect, divide)
+
+
+def compaction_resistance(wheel: Wheel, soil: Soil, load: Scalar) -> jax.Array:
+    """Rolling resistance `[...]` in N of a towed rigid wheel under `load` in N.
+
+    Bekker's closed form for small sinkage and n < 3 (Wong 2008, eq. 2.57 and 2.58).
+    """
+    modulus = soil.kc + wheel.width * soil.kphi
+    root = jnp.sqrt(2 * jnp.asarray(wheel.radius))
+    sinkage = (3 * load / ((3 - soil.n) * modulus * root)) ** (2 / (2 * soil.n + 1))
+    return modulus * sinkage ** (soil.n + 1) / (soil.n + 1)

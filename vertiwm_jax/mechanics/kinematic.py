@@ -1,0 +1,106 @@
+"""Vehicles without forces: the baselines that every dynamics model has to beat."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from vertiwm_jax import geometry
+from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
+from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.map import TerrainMap
+
+
+@dataclass(frozen=True)
+class ConstantVelocity:
+    """Keeps the body twist: T' = T Exp(nu dt). Ignores command, ground and parameters."""
+
+    def init(self, params: None, terrain: TerrainMap, state: VehicleState) -> tuple[()]:
+        return ()
+
+    def step(
+        self,
+        params: None,
+        terrain: TerrainMap,
+        history: tuple[()],
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, tuple[()]]:
+        twist = jnp.concatenate([state.velocity, state.angular_velocity], axis=-1)
+        pose = state.pose @ geometry.exp(STEP_SECONDS * twist)
+        rpy = geometry.rpy_from_rotation(pose.rotation())
+        return state.replace(position=pose.translation(), rpy=rpy), ()
+
+
+@struct.dataclass
+class BicycleParams:
+    """wheelbase and track, m; ride_height of the body origin above the ground, m; speed_lag, s."""
+
+    wheelbase: jax.Array
+    track: jax.Array
+    ride_height: jax.Array
+    speed_lag: jax.Array
+
+
+@dataclass(frozen=True)
+class KinematicBicycle:
+    """A bicycle without slip that follows its commands and lies on the ground under its wheels.
+
+    The speed follows the command with a first-order lag; the steering angle follows at once.
+    Height, roll and pitch are those of the plane through the ground at the four wheels.
+    """
+
+    def init(self, params: BicycleParams, terrain: TerrainMap, state: VehicleState) -> tuple[()]:
+        return ()
+
+    def step(
+        self,
+        params: BicycleParams,
+        terrain: TerrainMap,
+        history: tuple[()],
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, tuple[()]]:
+        decay = jnp.exp(-STEP_SECONDS / params.speed_lag)
+        speed = command.speed + (state.velocity[0] - command.speed) * decay
+        # The body origin is halfway between the axles, so it slips by half the steering.
+        side_slip = jnp.arctan(0.5 * jnp.tan(command.steering))
+        yaw_rate = speed * 2.0 * jnp.sin(side_slip) / params.wheelbase
+        course = state.rpy[2] + 0.5 * STEP_SECONDS * yaw_rate + side_slip
+        # Speed is along the slope; its plan view is shorter.
+        level = jnp.cos(state.rpy[1]) * STEP_SECONDS * speed
+        xy = state.position[:2] + level * jnp.stack([jnp.cos(course), jnp.sin(course)])
+        yaw = geometry.wrap(state.rpy[2] + STEP_SECONDS * yaw_rate)
+        position, rpy = rest_on_ground(
+            terrain, xy, yaw, params.wheelbase, params.track, params.ride_height
+        )
+        velocity = speed * jnp.stack([jnp.cos(side_slip), jnp.sin(side_slip), 0.0 * speed])
+        tilt_rate = geometry.wrap(rpy - state.rpy)[:2] / STEP_SECONDS
+        angular_velocity = jnp.concatenate([tilt_rate, yaw_rate[None]])
+        return VehicleState(position, rpy, velocity, angular_velocity), ()
+
+
+def rest_on_ground(
+    terrain: TerrainMap,
+    xy: jax.Array,
+    yaw: jax.Array,
+    wheelbase: jax.Array,
+    track: jax.Array,
+    ride_height: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Position `[3]` and roll, pitch, yaw `[3]` of a vehicle lying on the ground at xy `[2]`.
+
+    It lies on the plane through the ground under its four wheels, its origin `ride_height`
+    above that plane.
+    """
+    forward = 0.5 * wheelbase * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
+    left = 0.5 * track * jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)])
+    wheels = xy + jnp.stack([forward + left, forward - left, -forward + left, -forward - left])
+    fl, fr, rl, rr = query.height(terrain, wheels)
+    rise = 0.5 * (fl + fr - rl - rr) / wheelbase
+    bank = 0.5 * (fl + rl - fr - rr) / track
+    pitch = -jnp.arctan(rise)
+    roll = jnp.arctan(bank * jnp.cos(pitch))
+    height = 0.25 * (fl + fr + rl + rr) + ride_height * jnp.sqrt(1 + rise**2 + bank**2)
+    return jnp.append(xy, height), jnp.stack([roll, pitch, yaw])

@@ -1,0 +1,243 @@
+"""Stresses under a rigid wheel on soil: contact angles, normal stress, shear, bulldozing.
+
+Angles are from the downward vertical, positive towards the direction of travel. The soil is
+entered at th1, stressed most at thm, left at th2; where the wheel skids the flow of soil under
+it reverses at th0. Everything is elementwise over any axes `[...]`.
+
+Sources: Bekker, Introduction to Terrain-Vehicle Systems (1969); Wong and Reece, J. Terramechanics
+4(1) and 4(2) (1967); Janosi and Hanamoto (1961); Ishigami et al., J. Field Robotics 24 (2007);
+Wong, Theory of Ground Vehicles, 4th ed. (2008), ch. 2; Pavlov and Johnson, J. Terramechanics
+(2024).
+"""
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from vertiwm_jax.terrain.soil import Soil
+
+Scalar = jax.Array | float
+
+_MAX_PEAK = 0.98  # of th1; the peak stays inside the contact
+
+
+@struct.dataclass
+class Wheel:
+    """A rigid wheel `[...]`. radius, width: m."""
+
+    radius: Scalar
+    width: Scalar
+
+
+@struct.dataclass
+class Contact:
+    """Empirical coefficients of wheel-soil contact `[...]`; s is slip, positive when driven.
+
+    peak, peak_slip: thm = (peak + peak_slip max(s, 0)) th1.
+    exit, exit_slip: th2 = (exit + exit_slip max(s, 0)) th1.
+    rebound: lam of th2 = -acos(1 - lam h / r), added to the former (Ishigami 2007).
+    slip_sinkage, skid_sinkage: n = n0 + slip_sinkage s driven, n0 - skid_sinkage s braked.
+    unload_stiffness, unload_slope: k0 in Pa/m and A_u in Pa/m2 of Wong's unloading and reloading
+        p = p_u - (k0 + A_u z_u)(z_u - z); stiff enough to be felt in a rut only.
+    creep_speed: m/s below which shear fades out, so that a standing wheel has smooth forces.
+    reversal: th0 of a skidding wheel. "linear": th1 (1 + s/2), shear along the slip velocity
+        (Pavlov 2024), continuous from driving to braking. "rankine": from the friction angle,
+        the stress peak there too, shear along the displacement (Wong and Reece 1967, towed).
+    bulldozing: pressure on the wheel's side, "ishigami" (2007) or "wong" (2008).
+    """
+
+    peak: Scalar = 0.4
+    peak_slip: Scalar = 0.15
+    exit: Scalar = 0.0
+    exit_slip: Scalar = 0.0
+    rebound: Scalar = 0.0
+    slip_sinkage: Scalar = 0.0
+    skid_sinkage: Scalar = 0.0
+    unload_stiffness: Scalar = 2e8
+    unload_slope: Scalar = 0.0
+    creep_speed: Scalar = 0.05
+    reversal: Literal["linear", "rankine"] = struct.field(pytree_node=False, default="linear")
+    bulldozing: Literal["ishigami", "wong"] = struct.field(pytree_node=False, default="ishigami")
+
+
+class Motion(NamedTuple):
+    """A wheel's motion seen along its travel, so that the soil is always entered ahead.
+
+    ahead: 1 forwards, -1 in reverse. hub, rim: m/s along the travel. lateral: m/s to the left.
+    spin: |omega| in rad/s, never zero. rolling: 1, fading to 0 at rest, where "ahead" has no
+    meaning. slip: see `slip`.
+    """
+
+    ahead: jax.Array
+    hub: jax.Array
+    rim: jax.Array
+    lateral: jax.Array
+    spin: jax.Array
+    rolling: jax.Array
+    slip: jax.Array
+
+
+class Patch(NamedTuple):
+    """Angles of the contact, rad: th1, thm, th2 and th0."""
+
+    entry: jax.Array
+    peak: jax.Array
+    exit: jax.Array
+    reversal: jax.Array
+
+
+class Arc(NamedTuple):
+    """A point of the rim: its angle with sine and cosine, and its cosine above the start's."""
+
+    angle: jax.Array
+    sin: jax.Array
+    cos: jax.Array
+    rise: jax.Array
+
+
+def slip(velocity_x: Scalar, rim_speed: Scalar, creep_speed: Scalar = 0.05) -> jax.Array:
+    """Slip `[...]` in [-1, 1]: 1 - v/(r w) driven, r w/v - 1 braked, zero at rest.
+
+    velocity_x, rim_speed (r w): m/s, signed; values and gradients are finite everywhere.
+    """
+    ahead = jnp.where(velocity_x + rim_speed >= 0, 1.0, -1.0)
+    faster = jnp.maximum(jnp.square(velocity_x), jnp.square(rim_speed))
+    s = ahead * (rim_speed - velocity_x) * jax.lax.rsqrt(faster + jnp.square(creep_speed))
+    return jnp.clip(s, -1.0, 1.0)
+
+
+def motion(
+    wheel: Wheel, creep_speed: Scalar, velocity_x: Scalar, velocity_y: jax.Array, omega: Scalar
+) -> Motion:
+    """The motion of a wheel `[...]`, from hub velocities in m/s and spin in rad/s."""
+    rim = wheel.radius * omega
+    both = velocity_x + rim
+    ahead = jnp.where(both >= 0, 1.0, -1.0)
+    return Motion(
+        ahead=ahead,
+        hub=ahead * velocity_x,
+        rim=ahead * rim,
+        lateral=velocity_y,
+        spin=jnp.sqrt(jnp.square(omega) + (creep_speed / wheel.radius) ** 2),
+        rolling=jnp.abs(both) * jax.lax.rsqrt(both**2 + creep_speed**2),
+        slip=slip(velocity_x, rim, creep_speed),
+    )
+
+
+def patch(contact: Contact, friction_angle: jax.Array, depth: jax.Array, m: Motion) -> Patch:
+    """Where a wheel touches soil at `depth`, in wheel radii."""
+    driven, braked = jnp.maximum(m.slip, 0.0), jnp.maximum(-m.slip, 0.0)
+    entry = _contact_angle(depth)
+    peak = (contact.peak + contact.peak_slip * driven) * entry
+    reversal = (1 - braked / 2) * entry
+    if contact.reversal == "rankine":
+        # cos(th0) - tan(a) sin(th0) = r w / v with a = 45 deg - phi/2, solved for th0.
+        a = jnp.pi / 4 - friction_angle / 2
+        skid = braked > 0
+        ratio = jnp.clip(jnp.where(skid, m.rim / jnp.where(skid, m.hub, 1.0), 0.0), 0.0, 1.0)
+        towed = jnp.arccos(ratio * jnp.cos(a)) - a
+        reversal = jnp.where(skid, jnp.minimum(towed, _MAX_PEAK * entry), entry)
+        peak = jnp.where(skid, reversal, peak)
+    peak = jnp.minimum(peak, _MAX_PEAK * entry)
+    rebound = _contact_angle(contact.rebound * depth)
+    leave = (contact.exit + contact.exit_slip * driven) * entry - rebound
+    return Patch(entry, peak, jnp.minimum(leave, peak), reversal)
+
+
+def _contact_angle(depth: jax.Array) -> jax.Array:
+    """acos(1 - depth) without its cancellation; zero, with zero slope, at depth <= 0."""
+    positive = depth > 0
+    half = jnp.sqrt(jnp.where(positive, depth, 1.0) / 2)
+    return jnp.where(positive, 2 * jnp.arcsin(half), 0.0)
+
+
+def arc(start: jax.Array, offset: jax.Array) -> Arc:
+    """The point at `offset` from the angle `start`, rad; offsets up to 4.2."""
+    # Half-angle identities keep `rise` exact near the start, where stress begins. Series serve
+    # for the library's sine and cosine, which would take most of the time of a wheel's forces.
+    a = offset / 2
+    y = a * a
+    sin_a = a * _horner(y, 1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
+    cos_a = _horner(y, 1, -1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600)
+    sin_start, cos_start = jnp.sin(start), jnp.cos(start)
+    rise = -2 * sin_a * (sin_start * cos_a + cos_start * sin_a)
+    advance = 2 * sin_a * (cos_start * cos_a - sin_start * sin_a)
+    return Arc(start + offset, sin_start + advance, cos_start + rise, rise)
+
+
+def _horner(x: jax.Array, *coefficients: float) -> jax.Array:
+    value = jnp.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        value = coefficient + x * value
+    return value
+
+
+def rut_floor(keq: Scalar, n: Scalar, unload: Scalar, rut: jax.Array) -> jax.Array:
+    """Depth in m of the floor of a rut `rut` m deep when loaded, after its elastic rebound."""
+    compacted = rut > 0
+    deepest = jnp.where(compacted, rut, 1.0)
+    rebound = jnp.minimum(keq * jnp.exp(n * jnp.log(deepest)) / unload, deepest)
+    return jnp.where(compacted, deepest - rebound, 0.0)
+
+
+def normal_stress(
+    keq: Scalar, n: Scalar, unload: Scalar, floor: jax.Array, z: jax.Array
+) -> jax.Array:
+    """Bekker's pressure in Pa, `z` m below the floor of the rut, never above elastic reloading."""
+    # The clip keeps the slope of z^n finite where n < 1.
+    z = jnp.maximum(z, 1e-9)
+    return jnp.minimum(keq * jnp.exp(n * jnp.log(floor + z)), unload * z)
+
+
+def shear_stress(
+    soil: Soil, contact: Contact, p: Patch, m: Motion, at: Arc, sigma: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Janosi-Hanamoto shear in Pa on the wheel: along the rim, forwards, and to the left."""
+    # Ahead of th0 the soil is pushed forward with the mean cosine of that arc (Wong and Reece's
+    # 1 + Kv (1 + i)); written as a sinc it stays exact when the arc vanishes.
+    half = (p.entry - p.reversal) / 2
+    mean = jnp.cos((p.entry + p.reversal) / 2) * jnp.sinc(half / jnp.pi)
+    pushed = at.angle > p.reversal
+    # Displacements times the spin: finite when the wheel locks.
+    path_x = jnp.where(
+        pushed,
+        m.hub * (mean * (p.entry - at.angle) - (jnp.sin(p.entry) - at.sin)),
+        m.rim * (p.reversal - at.angle) - m.hub * (jnp.sin(p.reversal) - at.sin),
+    )
+    path_y = m.lateral * (at.angle - p.entry)
+    creep = contact.creep_speed
+    path = jnp.sqrt(path_x**2 + path_y**2 + (1e-3 * creep) ** 2)
+    strength = soil.cohesion + sigma * jnp.tan(soil.friction_angle)
+    tau = strength * (1 - jnp.exp(-path / (soil.shear_modulus * m.spin)))
+    if contact.reversal == "rankine":
+        along, across = path_x, path_y
+    else:
+        along = jnp.where(pushed, m.hub * (mean - at.cos), m.rim - m.hub * at.cos)
+        across = -m.lateral
+    tau = tau * jax.lax.rsqrt(along**2 + across**2 + creep**2)
+    return tau * along, tau * across
+
+
+def bulldozing(
+    soil: Soil, contact: Contact, radius: Scalar, p: Patch, m: Motion, at: Arc
+) -> jax.Array:
+    """Side force per angle and wheel radius, N/(rad m), of the soil the wheel's flank pushes."""
+    sin_slip_angle = -m.lateral * jax.lax.rsqrt(
+        m.hub**2 + m.lateral**2 + contact.creep_speed**2
+    )
+    tangent = jnp.tan(soil.friction_angle)
+    cotangent = jnp.tan(jnp.pi / 4 + soil.friction_angle / 2)  # of Xc; equals tan(Xc + phi)
+    if contact.bulldozing == "ishigami":
+        below = radius * jnp.maximum(at.cos - jnp.cos(p.entry), 0.0)
+        d2 = cotangent + cotangent**2 * tangent
+        pressure = 2 * cotangent * below * (soil.cohesion + d2 * soil.unit_weight * below / 2)
+        return pressure * (1 - below * at.cos / radius) * sin_slip_angle
+    # Wong: the pressed soil fills the segment under the chord from exit to entry.
+    share = (at.sin - jnp.sin(p.exit)) / (jnp.sin(p.entry) - jnp.sin(p.exit))
+    chord = share * (jnp.cos(p.exit) - jnp.cos(p.entry))
+    height = radius * jnp.clip(chord - jnp.cos(p.exit) + at.cos, 0.0, 2 * at.cos)
+    pressure = soil.unit_weight / 2 * (height * cotangent) ** 2 * (1 + cotangent * tangent / 2)
+    pressure = pressure + 2 * height * soil.cohesion * cotangent
+    return pressure * at.cos * sin_slip_angle * jnp.abs(sin_slip_angle)

@@ -1,0 +1,112 @@
+"""What a four-wheeled vehicle is: masses, suspension, drivetrain, controller, limits."""
+
+from typing import cast
+
+import jax
+import numpy as np
+from flax import struct
+
+
+@struct.dataclass
+class Vehicle:
+    """A vehicle with independent suspension and all-wheel drive; SI units, body axes.
+
+    Wheels are front-left, front-right, rear-left, rear-right. The body origin lies between the
+    wheel centres of the design position.
+
+    mass: `[]` kg, wheels included.
+    centre_of_mass: `[3]` m.
+    inertia: `[3]` kg m2, principal moments about the centre of mass.
+    wheel_position: `[4, 2]` x, y of the wheel centres, m.
+    wheel_radius, wheel_width: `[]` m.
+    wheel_inertia: `[]` kg m2 about the axle.
+    wheel_weight: `[]` N, what pulls an airborne wheel down.
+    spring: `[4]` N/m at the wheel.
+    damper: `[4]` N s/m at the wheel.
+    free_travel: `[4]` m, wheel height in the body at which the spring is relaxed.
+    steering_limit: `[]` rad; steering_rate: `[]` rad/s, both at the front wheels.
+    speed_gain: `[]` s/m, pedal per speed error; full pedal is 1.
+    wheel_torque: `[]` N m a wheel at full throttle; wheel_power: `[]` W a wheel at most.
+    brake_torque: `[]` N m a wheel at full braking.
+    tyre_friction: `[]` the tyre's own friction coefficient; contact takes the smaller one.
+    belly: `[P, 3]` m, points under the chassis that touch the ground first.
+    length, width: `[]` m, the rectangle that collides with obstacles, centred on the origin.
+    """
+
+    mass: jax.Array
+    centre_of_mass: jax.Array
+    inertia: jax.Array
+    wheel_position: jax.Array
+    wheel_radius: jax.Array
+    wheel_width: jax.Array
+    wheel_inertia: jax.Array
+    wheel_weight: jax.Array
+    spring: jax.Array
+    damper: jax.Array
+    free_travel: jax.Array
+    steering_limit: jax.Array
+    steering_rate: jax.Array
+    speed_gain: jax.Array
+    wheel_torque: jax.Array
+    wheel_power: jax.Array
+    brake_torque: jax.Array
+    tyre_friction: jax.Array
+    belly: jax.Array
+    length: jax.Array
+    width: jax.Array
+
+    @property
+    def wheelbase(self) -> jax.Array:
+        """`[]` m between the axles."""
+        return self.wheel_position[0, 0] - self.wheel_position[2, 0]
+
+    @property
+    def track(self) -> jax.Array:
+        """`[]` m between left and right wheels."""
+        return self.wheel_position[0, 1] - self.wheel_position[1, 1]
+
+
+def _vehicle(**values: object) -> Vehicle:
+    """NumPy float32 leaves: importing must not start a device."""
+    arrays = {name: np.asarray(value, np.float32) for name, value in values.items()}
+    return Vehicle(**cast(dict[str, jax.Array], arrays))
+
+
+def _corners(x: float, y: float) -> list[tuple[float, float]]:
+    return [(x, y), (x, -y), (-x, y), (-x, -y)]
+
+
+def _underside(x: float, y: float, z: float) -> list[tuple[float, float, float]]:
+    return [(i * x, j * y, z) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+
+
+def hmmwv() -> Vehicle:
+    """Chrono 9.0.1's HMMWV_Reduced with rigid tyres, as Verti-Bench drives it.
+
+    Masses, geometry and controller are Chrono's. Spring and damper rates at the wheel, torque
+    and power were identified from Chrono drives (wheel travel against wheel force; spin-up of
+    airborne wheels): the rates of the struts themselves act through linkages.
+    """
+    return _vehicle(
+        mass=2493.6,
+        centre_of_mass=(0.0518, 0.0, 0.1838),
+        inertia=(1444.9, 4122.4, 5025.8),
+        wheel_position=_corners(1.651, 0.910),
+        wheel_radius=0.467,
+        wheel_width=0.254,
+        wheel_inertia=11.0,
+        wheel_weight=553.0,
+        spring=(147e3, 147e3, 265e3, 265e3),
+        damper=(22.4e3, 22.4e3, 28.5e3, 28.5e3),
+        free_travel=(0.0249, 0.0249, -0.0186, -0.0186),
+        steering_limit=0.3725,
+        steering_rate=3.725,
+        speed_gain=1.0,
+        wheel_torque=6400.0,
+        wheel_power=45e3,
+        brake_torque=4000.0,
+        tyre_friction=0.9,
+        belly=_underside(1.0, 0.5, 0.0),
+        length=4.6,
+        width=2.1,
+    )

@@ -1,0 +1,1 @@
+"""Learned pieces, nothing composed."""

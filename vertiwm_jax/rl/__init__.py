@@ -1,0 +1,1 @@
+"""Reinforcement learning: algorithms compiled whole, and the host loop around them."""

@@ -1,0 +1,51 @@
+"""Generalised advantage estimation that tells truncation from termination."""
+
+import jax
+import jax.numpy as jnp
+
+
+def generalised_advantages(
+    rewards: jax.Array,
+    values: jax.Array,
+    next_values: jax.Array,
+    terminated: jax.Array,
+    truncated: jax.Array,
+    discount: float,
+    trace: float,
+) -> jax.Array:
+    """`[T, ...]` advantages, GAE(lambda) of Schulman et al. (2016), eq. 16.
+
+    rewards: `[T, ...]` of step t.
+    values: `[T, ...]` V of the observation before step t.
+    next_values: `[T, ...]` V of the observation after step t, before any automatic reset.
+    terminated: `[T, ...]` bool, the task ended: what follows is worth nothing.
+    truncated: `[T, ...]` bool, time ran out: what follows is worth `next_values`.
+    discount: gamma; trace: lambda.
+    """
+    errors = rewards + discount * jnp.where(terminated, 0.0, next_values) - values
+    decays = discount * trace * ~(terminated | truncated)
+
+    def accumulate(following: jax.Array, inputs: tuple[jax.Array, jax.Array]):
+        error, decay = inputs
+        advantage = error + decay * following
+        return advantage, advantage
+
+    return jax.lax.scan(accumulate, jnp.zeros_like(values[0]), (errors, decays), reverse=True)[1]
+
+
+def discounted_returns(
+    previous: jax.Array, rewards: jax.Array, done: jax.Array, discount: float
+) -> tuple[jax.Array, jax.Array]:
+    """Returns accumulated forwards, whose spread is the scale of the rewards.
+
+    previous: `[...]` returns so far of the running episodes.
+    rewards, done: `[T, ...]` of each step.
+    Gives the `[...]` returns to carry on with, 0 where an episode ended, and `[T, ...]` all.
+    """
+
+    def accumulate(before: jax.Array, inputs: tuple[jax.Array, jax.Array]):
+        reward, ended = inputs
+        after = discount * before + reward
+        return jnp.where(ended, 0.0, after), after
+
+    return jax.lax.scan(accumulate, previous, (rewards, done))

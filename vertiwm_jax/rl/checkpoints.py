@@ -1,0 +1,126 @@
+"""Checkpoints of a whole training state, written as a whole or not at all."""
+
+import contextlib
+import logging
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from orbax.checkpoint import v1 as ocp
+
+State = TypeVar("State")
+
+_PARTIAL = "*.orbax-checkpoint-tmp*"
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint that cannot be written or read; the message names the path and the mend."""
+
+
+def save(folder: str | Path, step: int, state: Any, keep: int) -> Path:
+    """Write `state` as `folder/step` and then delete all but the newest `keep` checkpoints.
+
+    state: any pytree of non-empty arrays, random keys included.
+    Until a checkpoint is complete it has another name, so whatever interrupts the write leaves
+    the earlier ones as they are. What the system refuses (a full disk) raises `CheckpointError`.
+    """
+    folder = Path(folder).absolute()
+    path = folder / str(step)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _clean(folder)
+        with _quiet():
+            ocp.save(str(path), _flatten(state))
+    # The storage library reports what the system refuses as ValueError.
+    except (OSError, ValueError) as error:
+        _clean(folder)
+        previous = latest(folder)
+        kept = f"the checkpoint {previous} is still good" if previous else "there is none before"
+        reason = str(error).splitlines()[0]
+        raise CheckpointError(
+            f"{path}: cannot write the checkpoint ({kept}); free space on the disk: {reason}"
+        ) from error
+    for old in _complete(folder)[:-keep]:
+        shutil.rmtree(old, ignore_errors=True)
+    return path
+
+
+def latest(folder: str | Path) -> Path | None:
+    """The newest complete checkpoint in `folder`, whose name is its step; None if there is none."""
+    checkpoints = _complete(Path(folder).absolute())
+    return checkpoints[-1] if checkpoints else None
+
+
+def load(path: str | Path, like: State) -> State:
+    """Read the checkpoint at `path` into the structure of `like`, arrays or `jax.eval_shape`'s.
+
+    A checkpoint with other leaves, shapes or types raises `CheckpointError` that names the first.
+    """
+    path = Path(path).absolute()
+    leaves = _flatten(like)
+    try:
+        with _quiet():
+            found = ocp.metadata(str(path)).metadata
+            _check(path, leaves, found)
+            sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+            abstract = {
+                name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+                for name, leaf in leaves.items()
+            }
+            restored = ocp.load(str(path), abstract)
+    except (OSError, ValueError, KeyError) as error:
+        reason = str(error).splitlines()[0]
+        raise CheckpointError(f"{path}: not a readable checkpoint: {reason}") from error
+    return jax.tree.unflatten(jax.tree.structure(like), [restored[name] for name in leaves])
+
+
+def _flatten(state: Any) -> dict[str, Any]:
+    """Leaves by name, so that a checkpoint depends on no class of ours."""
+    leaves = jax.tree.leaves_with_path(state)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+def _check(path: Path, expected: dict[str, Any], found: dict[str, Any]) -> None:
+    for name in [*expected, *(name for name in found if name not in expected)]:
+        want = _describe(expected[name]) if name in expected else "nothing"
+        have = _describe(found[name]) if name in found else "nothing"
+        if want != have:
+            raise CheckpointError(
+                f"{path}: {name}: expected {want}, found {have}; the checkpoint belongs to "
+                "another configuration, resume with the one in its run folder"
+            )
+
+
+def _describe(leaf: Any) -> str:
+    shape, dtype = tuple(leaf.shape), leaf.dtype
+    if jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        data = jax.eval_shape(jax.random.key_data, leaf)  # what is stored
+        shape, dtype = data.shape, data.dtype
+    return f"{dtype}{list(shape)}"
+
+
+def _complete(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    names = (path for path in folder.iterdir() if path.name.isdecimal())
+    return sorted(names, key=lambda path: int(path.name))
+
+
+def _clean(folder: Path) -> None:
+    for partial in folder.glob(_PARTIAL):
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps the storage library from printing the traces of errors that are raised anyway."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)

@@ -1,0 +1,54 @@
+"""Running mean and variance, and the normalisation made from them."""
+
+import dataclasses
+from typing import Self
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+EPSILON = 1e-8
+CLIP = 10.0
+
+
+@struct.dataclass
+class RunningStatistics:
+    """Mean and variance of all samples seen so far; mean 0 and variance 1 before the first.
+
+    mean, variance: `[...]`.
+    count: `[]` float32, samples seen.
+    """
+
+    mean: jax.Array
+    variance: jax.Array
+    count: jax.Array
+
+    @classmethod
+    def create(cls, shape: tuple[int, ...]) -> Self:
+        """Statistics of no sample of the given shape."""
+        return cls(jnp.zeros(shape), jnp.ones(shape), jnp.zeros(()))
+
+    def update(self, samples: jax.Array) -> Self:
+        """Adds `[B..., ...]` samples (any leading axes), by Chan et al. (1979), eq. 2.1."""
+        axes = tuple(range(samples.ndim - self.mean.ndim))
+        added = samples.size // self.mean.size
+        mean = jnp.mean(samples, axes)
+        variance = jnp.var(samples, axes)
+        total = self.count + added
+        share = added / total
+        delta = mean - self.mean
+        return dataclasses.replace(
+            self,
+            mean=self.mean + delta * share,
+            variance=(1 - share) * self.variance + share * (variance + delta**2 * (1 - share)),
+            count=total,
+        )
+
+    @property
+    def std(self) -> jax.Array:
+        """`[...]` standard deviation, never 0."""
+        return jnp.sqrt(self.variance + EPSILON)
+
+    def normalise(self, x: jax.Array) -> jax.Array:
+        """`[..., ...]` to zero mean and unit variance, clipped to +-10."""
+        return jnp.clip((x - self.mean) / self.std, -CLIP, CLIP)

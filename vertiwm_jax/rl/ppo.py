@@ -1,0 +1,404 @@
+"""Proximal policy optimisation, collection and update in one compiled program.
+
+Schulman et al. (2017), with the details of Andrychowicz et al. (2021). An algorithm is a frozen
+object with two pure functions, `init` and `iterate`, over one `TrainState`; several seeds are a
+`vmap` of both.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from gymnax.environments.environment import Environment
+
+from vertiwm_jax.networks.policy import Actor, Critic, Gaussian
+from vertiwm_jax.rl.advantages import discounted_returns, generalised_advantages
+from vertiwm_jax.rl.learned import MeanAction
+from vertiwm_jax.rl.normalise import RunningStatistics
+
+Params = Any
+Metrics = dict[str, jax.Array]
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Settings of PPO; the defaults suit the navigation task on the built-in simulator."""
+
+    transitions: int = 2_000_000
+    """Environment steps of the whole training, rounded up to whole iterations."""
+    num_envs: int = 256
+    """Environments run side by side."""
+    num_steps: int = 64
+    """Steps of each environment in an iteration."""
+    epochs: int = 4
+    """Passes over the data of an iteration."""
+    minibatches: int = 8
+    """Gradient steps in a pass; divides num_envs * num_steps."""
+    discount: float = 0.99
+    """Gamma."""
+    trace: float = 0.95
+    """Lambda of the generalised advantage estimator."""
+    clip: float = 0.2
+    """Largest change of the probability ratio that is rewarded."""
+    value_clip: float | None = None
+    """Largest change of a value in an iteration; none by default."""
+    learning_rate: float = 5e-4
+    """Of Adam, at the start."""
+    schedule: Literal["constant", "linear", "cosine"] = "linear"
+    """How the learning rate goes, to 0 at the end unless constant."""
+    max_gradient_norm: float = 0.5
+    """Gradients are clipped to this global norm."""
+    value_weight: float = 0.5
+    """Weight of the value loss."""
+    entropy_weight: float = 0.0
+    """Weight of the entropy bonus."""
+    hidden: tuple[int, ...] = (128, 128)
+    """Widths of the layers of the actor and of the critic."""
+    initial_log_std: float = -0.5
+    """Log standard deviation of the first policy, in units of half the action range."""
+    normalise_observations: bool = True
+    """Whether observations are brought to zero mean and unit variance."""
+    normalise_rewards: bool = True
+    """Whether rewards are divided by the running deviation of the discounted return."""
+
+    def __post_init__(self):
+        if self.batch % self.minibatches:
+            divisor = math.gcd(self.minibatches, self.batch)
+            raise ValueError(
+                f"minibatches: {self.minibatches} does not divide num_envs * num_steps = "
+                f"{self.batch}; choose a divisor, for example {divisor}"
+            )
+
+    @property
+    def batch(self) -> int:
+        """Transitions of one iteration."""
+        return self.num_envs * self.num_steps
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of the whole training."""
+        return math.ceil(self.transitions / self.batch)
+
+    @property
+    def learning_rate_schedule(self) -> optax.Schedule:
+        """Learning rate as a function of the gradient steps done."""
+        steps = self.iterations * self.epochs * self.minibatches
+        return {
+            "constant": optax.constant_schedule(self.learning_rate),
+            "linear": optax.linear_schedule(self.learning_rate, 0.0, steps),
+            "cosine": optax.cosine_decay_schedule(self.learning_rate, steps),
+        }[self.schedule]
+
+
+@struct.dataclass
+class Environments:
+    """N running environments.
+
+    state: the environment's own, leaves `[N, ...]`.
+    observation: `[N, O]` what the policy sees next, not normalised.
+    discounted_return: `[N]` of the running episode so far.
+    episode_return, episode_length: `[N]` undiscounted sum of rewards and steps so far.
+    """
+
+    state: Any
+    observation: jax.Array
+    discounted_return: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+
+
+@struct.dataclass
+class TrainState:
+    """All that training carries from one iteration to the next.
+
+    iteration: `[]` int32, iterations done.
+    key: `[]` random key.
+    params: the networks' weights, `{"actor": ..., "critic": ...}`.
+    optimiser: the state of Adam.
+    observations: statistics of observations, `[O]`; those of no sample if they are used raw.
+    returns: statistics of discounted returns, `[]`; likewise.
+    environments: where the environments stand.
+    """
+
+    iteration: jax.Array
+    key: jax.Array
+    params: Params
+    optimiser: optax.OptState
+    observations: RunningStatistics
+    returns: RunningStatistics
+    environments: Environments
+
+
+@struct.dataclass
+class Transitions:
+    """Steps as collected, `[T, N]`; `observation` not normalised, `action` not clipped."""
+
+    observation: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    next_value: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+    outcomes: Metrics
+
+
+@struct.dataclass
+class Batch:
+    """What the loss is made of, `[B]`; `observation` is normalised, `target` a lambda return."""
+
+    observation: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    value: jax.Array
+    advantage: jax.Array
+    target: jax.Array
+
+
+@dataclass(frozen=True)
+class PPO:
+    """PPO on a gymnax environment with a flat observation and a bounded Box of actions.
+
+    env: static; its parameters are an argument of every function.
+    outcomes: what to report of an episode, from the `info` of its last step: named scalars,
+        which are averaged over the episodes that end in an iteration.
+    """
+
+    env: Environment
+    config: PPOConfig
+    outcomes: Callable[[dict[str, jax.Array]], Metrics] = lambda info: {}
+
+    def init(self, env_params: Params, key: jax.Array) -> TrainState:
+        """The state before the first iteration."""
+        key, reset_key, actor_key, critic_key = jax.random.split(key, 4)
+        reset_keys = jax.random.split(reset_key, self.config.num_envs)
+        observation, state = jax.vmap(self.env.reset, (0, None))(reset_keys, env_params)
+        params = {
+            "actor": self._actor(env_params).init(actor_key, observation[0]),
+            "critic": self._critic.init(critic_key, observation[0]),
+        }
+        zeros = jnp.zeros(self.config.num_envs)
+        return TrainState(
+            iteration=jnp.zeros((), jnp.int32),
+            key=key,
+            params=params,
+            optimiser=self._optimiser.init(params),
+            observations=RunningStatistics.create(observation.shape[1:]),
+            returns=RunningStatistics.create(()),
+            environments=Environments(state, observation, zeros, zeros, zeros),
+        )
+
+    def iterate(self, env_params: Params, state: TrainState) -> tuple[TrainState, Metrics]:
+        """Collects `batch` transitions and learns from them; jit it with `state` donated.
+
+        The metrics are scalars. Those of episodes are means over the episodes that ended in
+        this iteration, NaN if there were none; `finite` says whether all weights still are.
+        """
+        key, collect_key, update_key = jax.random.split(state.key, 3)
+        with jax.named_scope("collect"):
+            environments, transitions = self._collect(env_params, state, collect_key)
+        with jax.named_scope("advantages"):
+            done = transitions.terminated | transitions.truncated
+            discounted_return, discounted = discounted_returns(
+                environments.discounted_return, transitions.reward, done, self.config.discount
+            )
+            returns, observations = state.returns, state.observations
+            if self.config.normalise_rewards:
+                returns = returns.update(discounted)
+            if self.config.normalise_observations:
+                # From the next iteration on: within one, all are normalised alike.
+                observations = observations.update(transitions.observation)
+            batch = self._batch(state, returns, transitions)
+        with jax.named_scope("update"):
+            params, optimiser, losses = self._update(env_params, state, batch, update_key)
+        finite = jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), (params, losses))
+        metrics = {
+            **losses,
+            **_episodes(transitions, done),
+            "reward": jnp.mean(transitions.reward),
+            "explained_variance": 1 - jnp.var(batch.target - batch.value) / jnp.var(batch.target),
+            "finite": jnp.all(jnp.stack(jax.tree.leaves(finite))),
+        }
+        state = TrainState(
+            iteration=state.iteration + 1,
+            key=key,
+            params=params,
+            optimiser=optimiser,
+            observations=observations,
+            returns=returns,
+            environments=dataclasses.replace(environments, discounted_return=discounted_return),
+        )
+        return state, metrics
+
+    def policy(self, env_params: Params, state: TrainState) -> MeanAction:
+        """What `state` has learned."""
+        return MeanAction(self._actor(env_params), state.params["actor"], state.observations)
+
+    def value(self, state: TrainState, observation: jax.Array) -> jax.Array:
+        """`[..., O]` observations to `[...]` values, in units of reward."""
+        return state.returns.std * self._value(
+            state.params, state.observations.normalise(observation)
+        )
+
+    def _actor(self, env_params: Params) -> Actor:
+        actions = math.prod(self.env.action_space(env_params).shape)
+        return Actor(actions, self.config.hidden, self.config.initial_log_std)
+
+    @property
+    def _critic(self) -> Critic:
+        return Critic(self.config.hidden)
+
+    @property
+    def _optimiser(self) -> optax.GradientTransformation:
+        return optax.chain(
+            optax.clip_by_global_norm(self.config.max_gradient_norm),
+            optax.adam(self.config.learning_rate_schedule, eps=1e-5),
+        )
+
+    def _value(self, params: Params, observation: jax.Array) -> jax.Array:
+        return cast(jax.Array, self._critic.apply(params["critic"], observation))
+
+    def _collect(
+        self, env_params: Params, state: TrainState, key: jax.Array
+    ) -> tuple[Environments, Transitions]:
+        """T steps of N environments with the policy as it is."""
+        actor = self._actor(env_params)
+        space = self.env.action_space(env_params)
+        low, high = jnp.asarray(space.low), jnp.asarray(space.high)
+        step = jax.vmap(self.env.step, (0, 0, 0, None))
+
+        def advance(environments: Environments, key: jax.Array) -> tuple[Environments, Transitions]:
+            action_key, step_key = jax.random.split(key)
+            seen = state.observations.normalise(environments.observation)
+            policy = cast(Gaussian, actor.apply(state.params["actor"], seen))
+            action = policy.sample(action_key)
+            bounded = low + (high - low) * (jnp.clip(action, -1, 1) + 1) / 2
+            step_keys = jax.random.split(step_key, self.config.num_envs)
+            observation, env_state, reward, terminated, truncated, info = step(
+                step_keys, environments.state, bounded, env_params
+            )
+            final = state.observations.normalise(info["final_observation"])
+            episode_return = environments.episode_return + reward
+            episode_length = environments.episode_length + 1
+            transitions = Transitions(
+                observation=environments.observation,
+                action=action,
+                log_prob=policy.log_prob(action),
+                reward=reward,
+                terminated=terminated,
+                truncated=truncated,
+                next_value=self._value(state.params, final),
+                episode_return=episode_return,
+                episode_length=episode_length,
+                outcomes=jax.vmap(self.outcomes)(info),
+            )
+            done = terminated | truncated
+            environments = dataclasses.replace(
+                environments,
+                state=env_state,
+                observation=observation,
+                episode_return=jnp.where(done, 0.0, episode_return),
+                episode_length=jnp.where(done, 0.0, episode_length),
+            )
+            return environments, transitions
+
+        keys = jax.random.split(key, self.config.num_steps)
+        return jax.lax.scan(advance, state.environments, keys)
+
+    def _batch(
+        self, state: TrainState, returns: RunningStatistics, transitions: Transitions
+    ) -> Batch:
+        """Transitions `[T, N]` to the flat batch `[T N]` of the loss."""
+        observation = state.observations.normalise(transitions.observation)
+        value = self._value(state.params, observation)
+        advantage = generalised_advantages(
+            transitions.reward / returns.std,
+            value,
+            transitions.next_value,
+            transitions.terminated,
+            transitions.truncated,
+            self.config.discount,
+            self.config.trace,
+        )
+        batch = Batch(
+            observation=observation,
+            action=transitions.action,
+            log_prob=transitions.log_prob,
+            value=value,
+            advantage=advantage,
+            target=advantage + value,
+        )
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+
+    def _update(
+        self, env_params: Params, state: TrainState, batch: Batch, key: jax.Array
+    ) -> tuple[Params, optax.OptState, Metrics]:
+        """`epochs` passes of `minibatches` gradient steps; the losses are means over all."""
+        config = self.config
+        actor, optimiser = self._actor(env_params), self._optimiser
+
+        def loss(params: Params, batch: Batch) -> tuple[jax.Array, Metrics]:
+            policy = cast(Gaussian, actor.apply(params["actor"], batch.observation))
+            log_ratio = policy.log_prob(batch.action) - batch.log_prob
+            ratio = jnp.exp(log_ratio)
+            advantage = (batch.advantage - jnp.mean(batch.advantage)) / (
+                jnp.std(batch.advantage) + 1e-8
+            )
+            clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
+            policy_loss = -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
+
+            value = self._value(params, batch.observation)
+            error = (value - batch.target) ** 2
+            if config.value_clip is not None:
+                change = jnp.clip(value - batch.value, -config.value_clip, config.value_clip)
+                error = jnp.maximum(error, (batch.value + change - batch.target) ** 2)
+            value_loss = 0.5 * jnp.mean(error)
+
+            entropy = policy.entropy()
+            total = policy_loss + config.value_weight * value_loss - config.entropy_weight * entropy
+            return total, {
+                "policy_loss": policy_loss,
+                "value_loss": value_loss,
+                "entropy": entropy,
+                # The estimator k3 of Schulman (2020), "Approximating KL divergence".
+                "kl": jnp.mean(ratio - 1 - log_ratio),
+                "clip_fraction": jnp.mean(jnp.abs(ratio - 1) > config.clip),
+            }
+
+        def descend(carry: tuple[Params, optax.OptState], rows: jax.Array):
+            params, optimiser_state = carry
+            minibatch = jax.tree.map(lambda x: x[rows], batch)
+            gradients, losses = jax.grad(loss, has_aux=True)(params, minibatch)
+            updates, optimiser_state = optimiser.update(gradients, optimiser_state, params)
+            return (optax.apply_updates(params, updates), optimiser_state), losses
+
+        shuffle = jax.vmap(lambda key: jax.random.permutation(key, config.batch))
+        rows = shuffle(jax.random.split(key, config.epochs))
+        rows = rows.reshape(config.epochs * config.minibatches, -1)
+        (params, optimiser_state), losses = jax.lax.scan(
+            descend, (state.params, state.optimiser), rows
+        )
+        return params, optimiser_state, jax.tree.map(jnp.mean, losses)
+
+
+def _episodes(transitions: Transitions, done: jax.Array) -> Metrics:
+    """Means over the episodes that ended, and how many did."""
+    count = jnp.sum(done)
+
+    def mean(x: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.where(done, x, 0.0)) / count
+
+    return {
+        "episodes": count,
+        "episode_return": mean(transitions.episode_return),
+        "episode_length": mean(transitions.episode_length),
+        **jax.tree.map(mean, transitions.outcomes),
+    }

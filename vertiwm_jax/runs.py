@@ -1,0 +1,249 @@
+"""Run folders: configuration, metrics and progress of one command, safe against interruption."""
+
+import contextlib
+import json
+import os
+import time
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import rich.progress
+from rich.console import Console
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import (  # generated without types
+    Event,  # pyright: ignore[reportAttributeAccessIssue]
+    SessionLog,  # pyright: ignore[reportAttributeAccessIssue]
+)
+from tensorboardX.summary import scalar
+
+from vertiwm_jax import config
+
+METRICS = "metrics.jsonl"
+
+
+class RunError(RuntimeError):
+    """A run folder that cannot be read or written; the message names the path."""
+
+
+class Run:
+    """One run's folder: `config.yaml`, `metrics.jsonl`, TensorBoard events, and what doors add.
+
+    Made by `Run.create` and continued by `Run.open`.
+    """
+
+    def __init__(self, folder: Path, events: EventsWriter) -> None:
+        self.folder = folder
+        self._events = events
+
+    @classmethod
+    def create(cls, root: str | Path, name: str, settings: Any) -> Self:
+        """Make `root/name-YYYYmmdd-HHMMSS/` and write the dataclass `settings` into it.
+
+        A folder that cannot be made or written raises `RunError`.
+        """
+        stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+        try:
+            folder = _make_folder(Path(root), f"{name}-{stamp}")
+            config.save(settings, folder / "config.yaml")
+            (folder / METRICS).touch()
+            return cls(folder, _events_writer(folder))
+        except OSError as error:
+            raise RunError(f"{root}: cannot start a run there: {error}") from error
+
+    @classmethod
+    def open(cls, folder: str | Path, step: int) -> Self:
+        """Continue a run from its checkpoint at `step`: later metrics are dropped.
+
+        A folder without metrics, or with damaged ones, raises `RunError`.
+        """
+        folder = Path(folder)
+        kept = [entry for entry in read_metrics(folder) if entry["step"] <= step]
+        write_atomic(folder / METRICS, "".join(json.dumps(entry) + "\n" for entry in kept))
+        try:
+            events = _events_writer(folder)
+            restart = SessionLog(status=SessionLog.START)
+            # TensorBoard hides what earlier event files hold from this step on.
+            events.write_event(Event(wall_time=time.time(), step=step + 1, session_log=restart))
+        except OSError as error:
+            raise RunError(f"{folder}: cannot continue the run: {error}") from error
+        return cls(folder, events)
+
+    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Record scalars at `step` in `metrics.jsonl` and for TensorBoard.
+
+        Both are on disk, or at least with the operating system, on return. A write that fails
+        (a full disk) leaves the earlier lines whole and raises `RunError`.
+        """
+        now = time.time()
+        values = {name: float(value) for name, value in metrics.items()}
+        path = self.folder / METRICS
+        _append(path, json.dumps({"step": int(step), "wall_time": round(now, 3), **values}) + "\n")
+        try:
+            for name, value in values.items():
+                event = Event(wall_time=now, step=int(step), summary=scalar(name, value))
+                self._events.write_event(event)
+            self._events.flush()
+        except OSError as error:
+            raise RunError(f"{self.folder}: cannot write TensorBoard events: {error}") from error
+
+    def close(self) -> None:
+        """Close the TensorBoard file; `metrics.jsonl` is always complete."""
+        try:
+            self._events.close()
+        except OSError as error:
+            raise RunError(f"{self.folder}: cannot write TensorBoard events: {error}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        # After a failed write the file cannot be flushed either: the first error is the news.
+        with contextlib.suppress(RunError) if error else contextlib.nullcontext():
+            self.close()
+
+    @staticmethod
+    def progress(total: int, description: str) -> "Progress":
+        """A progress display of `total` units, to be used as a context manager."""
+        return Progress(total, description)
+
+
+class Progress:
+    """A bar with rate and time left on a terminal; elsewhere a plain line now and then.
+
+    Use as a context manager and call `advance`.
+    """
+
+    def __init__(self, total: int, description: str, seconds_between_lines: float = 15.0) -> None:
+        self._total = total
+        self._description = description
+        self._interval = seconds_between_lines
+        self._console = Console()
+        self._done = 0
+        self._bar = rich.progress.Progress(
+            rich.progress.TextColumn("{task.description}"),
+            rich.progress.BarColumn(),
+            rich.progress.TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
+            _RateColumn(),
+            rich.progress.TimeRemainingColumn(),
+            rich.progress.TextColumn("{task.fields[note]}"),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._task = self._bar.add_task(description, total=total, note="")
+
+    def __enter__(self) -> Self:
+        self._start = self._last = time.monotonic()
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def advance(self, amount: int = 1, note: str = "") -> None:
+        """Count `amount` more units as done; `note` is shown beside the rate."""
+        self._done += amount
+        self._bar.update(self._task, advance=amount, note=note)
+        now = time.monotonic()
+        due = now - self._last >= self._interval or self._done >= self._total
+        if due and not self._console.is_terminal:
+            self._last = now
+            rate = self._done / max(now - self._start, 1e-9)
+            left = max(self._total - self._done, 0) / max(rate, 1e-9)
+            print(
+                f"{self._description} {self._done:,}/{self._total:,}  {rate:,.0f}/s  "
+                f"{left:,.0f} s left  {note}".rstrip(),
+                flush=True,
+            )
+
+
+class _RateColumn(rich.progress.ProgressColumn):
+    def render(self, task: rich.progress.Task) -> str:
+        return f"{task.speed or 0:,.0f}/s"
+
+
+def read_metrics(folder: str | Path) -> list[dict[str, float]]:
+    """The lines of a run's `metrics.jsonl`, each with `step`, `wall_time` (s) and its scalars.
+
+    A torn last line, left by a machine that stopped in the middle of a write, is passed over.
+    A missing file or any other damaged line raises `RunError`.
+    """
+    path = Path(folder) / METRICS
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    except (OSError, UnicodeDecodeError) as error:
+        raise RunError(f"{path}: cannot read metrics: {error}") from error
+    entries = []
+    for number, line in enumerate(lines, start=1):
+        if not line.endswith("\n"):
+            break
+        try:
+            entry = json.loads(line)
+            entry["step"] = int(entry["step"])
+        except (ValueError, TypeError, KeyError) as error:
+            expected = "expected a JSON object with a 'step'"
+            raise RunError(f"{path}: line {number}: {expected}, found {line[:60]!r}") from error
+        entries.append(entry)
+    return entries
+
+
+def write_atomic(path: str | Path, data: bytes | str) -> None:
+    """Replace the file at `path` by `data` as a whole, or not at all.
+
+    Text is written as UTF-8. On any failure the old content stays and no partial file is left;
+    what the system refuses (a full disk, no permission) raises `RunError`.
+    """
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        try:
+            with partial.open("wb") as file:
+                file.write(data.encode() if isinstance(data, str) else data)
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(path)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise RunError(f"{path}: cannot write, the file is as it was: {error}") from error
+
+
+def _append(path: Path, line: str) -> None:
+    """Append one line; a write that fails midway is taken back."""
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND)
+        try:
+            length = os.fstat(descriptor).st_size
+            data = line.encode()
+            try:
+                while data:
+                    data = data[os.write(descriptor, data) :]
+            except BaseException:
+                os.ftruncate(descriptor, length)
+                raise
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise RunError(f"{path}: cannot append metrics: {error}") from error
+
+
+def _make_folder(root: Path, name: str) -> Path:
+    folder, number = root / name, 1
+    while folder.exists():
+        number += 1
+        folder = root / f"{name}-{number}"
+    folder.mkdir(parents=True)
+    return folder
+
+
+def _events_writer(folder: Path) -> EventsWriter:
+    # Written in this thread: a background writer would lose a full disk's error, then hang.
+    return EventsWriter(str(folder / "events"), filename_suffix=f".{time.time_ns()}")

@@ -1,0 +1,244 @@
+"""Maps on disk: the `.npz` layout of the Chrono drives, and a user's own height map."""
+
+import json
+import math
+import os
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from vertiwm_jax.terrain import soil
+from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
+from vertiwm_jax.terrain.map import ELEVATION_RANGE, MapError, TerrainMap, build, stack
+from vertiwm_jax.terrain.soil import Soil
+
+# How Chrono calls our soil parameters, and how many of its units make one of ours.
+_SOIL_FIELDS = {
+    "Bekker_Kphi": ("kphi", 1.0),
+    "Bekker_Kc": ("kc", 1.0),
+    "Bekker_n": ("n", 1.0),
+    "Mohr_cohesion": ("cohesion", 1.0),
+    "Mohr_friction_deg": ("friction_angle", math.degrees(1.0)),
+    "Janosi_shear": ("shear_modulus", 1.0),
+    "unit_weight": ("unit_weight", 1.0),
+}
+
+
+def load(path: str | Path) -> TerrainMap:
+    """The world in a `.npz` map, or those of a folder of them, stacked in the order of names.
+
+    Soils come from the file; what it does not say of a soil (its unit weight) comes from the
+    preset of the same name. Raises `MapError` naming the file and the field.
+    """
+    path = Path(path)
+    if path.is_dir():
+        files = sorted(path.glob("*.npz"))
+        if not files:
+            raise MapError(str(path), "folder", "one .npz map or more", "none")
+        return stack([_load_world(file) for file in files], [str(file) for file in files])
+    return _load_world(path)
+
+
+def save(terrain: TerrainMap, path: str | Path) -> None:
+    """Writes the selected world in the layout that `load` reads; whole or not at all."""
+    path = Path(path)
+    world = int(terrain.world)
+    elevation, semantic, friction, obstacles = (
+        np.asarray(x[world])
+        for x in (terrain.elevation, terrain.semantic, terrain.friction, terrain.obstacles)
+    )
+    deformable = np.asarray(terrain.deformable)
+    rows, columns = (
+        np.minimum(np.arange(n) * cells // (n - 1), cells - 1)
+        for n, cells in zip(elevation.shape, semantic.shape, strict=True)
+    )
+    soils = {
+        name: [float(getattr(terrain.soils, f)[k]) * unit for f, unit in _SOIL_FIELDS.values()]
+        for k, name in enumerate(terrain.class_names)
+        if deformable[k]
+    }
+    meta = {
+        "classes": terrain.class_names,
+        "soil_fields": list(_SOIL_FIELDS),
+        "soils": soils,
+        "elevation_range": np.asarray(terrain.elevation_range).tolist(),
+    }
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with partial.open("wb") as stream:
+            np.savez_compressed(
+                stream,
+                elevation=elevation,
+                semantic=semantic[np.ix_(rows, columns)],
+                resolution=np.asarray(terrain.resolution),
+                origin=np.asarray(terrain.origin),
+                class_rgb=np.asarray(terrain.class_rgb),
+                patch_class=semantic,
+                patch_friction=np.where(deformable[semantic], np.nan, friction).astype(np.float32),
+                obstacles=obstacles[(obstacles != 0).any(axis=1)],
+                meta=np.array(json.dumps(meta)),
+            )
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def from_heightmap(
+    path: str | Path,
+    resolution: float,
+    height_range: tuple[float, float] | None = None,
+    class_image: str | Path | None = None,
+    default_class: str = "grass",
+    elevation_range: tuple[float, float] = ELEVATION_RANGE,
+    classes: GroundClasses = STANDARD,
+) -> TerrainMap:
+    """A map from heights in a 16-bit PNG, `.npy` or GeoTIFF file; row 0 is north.
+
+    resolution: m between pixels. height_range: heights in m of the darkest and the brightest
+    integer a pixel can hold; without it, values are metres. class_image: an 8-bit image of ids or
+    an RGB image of the palette's colours, over the same extent at any resolution; without it, all
+    ground is `default_class`. Raises `MapError` naming the file and the field.
+    """
+    name = str(path)
+    if not resolution > 0:
+        raise MapError(name, "resolution", "metres between pixels, > 0", f"{resolution}")
+    heights = _read_raster(Path(path), "elevation")
+    if heights.ndim != 2:
+        raise MapError(name, "elevation", "one height a pixel", f"shape {heights.shape}")
+    if height_range is not None:
+        if not np.issubdtype(heights.dtype, np.unsignedinteger):
+            raise MapError(
+                name, "height_range", "unsigned integers to scale", f"dtype {heights.dtype}",
+                "leave height_range out: the values are taken as metres",
+            )  # fmt: skip
+        low, high = height_range
+        heights = low + heights * ((high - low) / np.iinfo(heights.dtype).max)
+    if class_image is not None:
+        semantic = _read_classes(Path(class_image), classes)
+    elif default_class in classes.names:
+        semantic = np.full((1, 1), classes.names.index(default_class), np.uint8)
+        semantic = np.broadcast_to(semantic, heights.shape)
+    else:
+        raise MapError(name, "default_class", f"one of {', '.join(classes.names)}", default_class)
+    return build(
+        heights,
+        semantic,
+        resolution=resolution,
+        elevation_range=elevation_range,
+        classes=classes,
+        name=name if class_image is None else f"{name} with {class_image}",
+    )
+
+
+def _load_world(path: Path) -> TerrainMap:
+    name = str(path)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {field: file[field] for field in file.files}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise MapError(name, "file", "an .npz map", str(error)) from None
+    wanted = ("elevation", "patch_class", "patch_friction", "obstacles", "class_rgb", "meta")
+    for field in (*wanted, "resolution", "origin"):
+        if field not in arrays:
+            raise MapError(name, field, "an array of this name", f"only {', '.join(arrays)}")
+    for field, shape in (("resolution", ()), ("origin", (2,))):
+        if arrays[field].shape != shape:
+            raise MapError(name, field, f"shape {shape}", f"{arrays[field].shape}")
+    try:
+        meta = json.loads(str(arrays["meta"]))
+    except json.JSONDecodeError as error:
+        raise MapError(name, "meta", "JSON text", str(error)) from None
+    return build(
+        arrays["elevation"],
+        arrays["patch_class"],
+        arrays["patch_friction"],
+        arrays["obstacles"],
+        resolution=float(arrays["resolution"]),
+        origin=tuple(arrays["origin"].tolist()),
+        elevation_range=tuple(meta.get("elevation_range", ELEVATION_RANGE)),
+        classes=_classes(meta, arrays["class_rgb"], name),
+        name=name,
+    )
+
+
+def _classes(meta: dict, rgb: np.ndarray, name: str) -> GroundClasses:
+    for field in ("classes", "soils", "soil_fields"):
+        if field not in meta:
+            raise MapError(name, f"meta.{field}", "an entry of this name", f"{', '.join(meta)}")
+    names = tuple(meta["classes"])
+    if unknown := set(meta["soils"]) - set(names):
+        raise MapError(name, "meta.soils", f"soils among {', '.join(names)}", f"{sorted(unknown)}")
+    soils = {}
+    for key, values in meta["soils"].items():
+        if len(values) != len(meta["soil_fields"]):
+            expected = f"{len(meta['soil_fields'])} numbers, as in meta.soil_fields"
+            raise MapError(name, f"meta.soils.{key}", expected, f"{len(values)}")
+        soils[key] = _soil(key, dict(zip(meta["soil_fields"], values, strict=True)), name)
+    # What friction the classes have on average is not in the file: every patch has its own.
+    return GroundClasses(names, rgb, np.zeros(len(names)), np.zeros(len(names)), soils)
+
+
+def _soil(key: str, values: dict[str, float], name: str) -> Soil:
+    known = {
+        field: jnp.float32(values[chrono] / unit)
+        for chrono, (field, unit) in _SOIL_FIELDS.items()
+        if chrono in values
+    }
+    if key in soil.PRESETS:
+        return replace(soil.PRESETS[key], **known)
+    missing = [c for c, (field, _) in _SOIL_FIELDS.items() if field not in known]
+    if missing:
+        raise MapError(
+            name, f"meta.soils.{key}", f"all of {', '.join(_SOIL_FIELDS)}", f"no {missing}",
+            "add them, or use the name of a preset",
+        )  # fmt: skip
+    return Soil(**known)
+
+
+def _read_raster(path: Path, field: str) -> np.ndarray:
+    """The pixels of an image, GeoTIFF or `.npy` file."""
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".npy":
+            return np.load(path, allow_pickle=False)
+        if suffix in (".tif", ".tiff"):
+            try:
+                import tifffile
+            except ImportError:
+                raise MapError(
+                    str(path), field, "the package tifffile to read GeoTIFF", "it is not installed",
+                    "pip install 'vertiwm-jax[geotiff]'",
+                ) from None  # fmt: skip
+            return tifffile.imread(path)
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB") if image.mode in ("P", "RGBA") else image)
+    except MapError:
+        raise
+    except (OSError, ValueError, UnidentifiedImageError) as error:
+        raise MapError(str(path), field, "a PNG, .npy or GeoTIFF file", str(error)) from None
+
+
+def _read_classes(path: Path, classes: GroundClasses) -> np.ndarray:
+    """`[r, c]` class ids from an image of ids or of palette colours."""
+    pixels = _read_raster(path, "class_image")
+    if pixels.ndim == 2:
+        return pixels
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise MapError(str(path), "class_image", "ids or RGB colours", f"shape {pixels.shape}")
+    matches = (pixels[:, :, None] == classes.rgb).all(-1)
+    unknown = np.argwhere(~matches.any(-1))
+    if len(unknown):
+        row, column = unknown[0]
+        palette = ", ".join(
+            f"{n} {tuple(c)}" for n, c in zip(classes.names, classes.rgb.tolist(), strict=True)
+        )
+        found = f"{tuple(pixels[row, column].tolist())} at row {row}, column {column}"
+        raise MapError(
+            str(path), "class_image", f"colours of the palette ({palette})",
+            f"{found} ({len(unknown)} such)", "save it without smoothing or compression loss",
+        )  # fmt: skip
+    return matches.argmax(-1).astype(np.uint8)

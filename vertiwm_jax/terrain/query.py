@@ -1,0 +1,176 @@
+"""Asking the map: vehicle-aligned patches, and the ground under points.
+
+Every gather is a flat index into the stacked worlds, clipped first and then promised in bounds,
+so that a batch of vehicles on different worlds is one gather and copies no map. Outside the map
+the ground continues level from its edge; a NaN coordinate reads the first row or column.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from vertiwm_jax.state import STEP_SECONDS, Patches
+from vertiwm_jax.terrain.map import TerrainMap
+
+PATCH_PIXELS = 128
+PATCH_METRES = 12.8
+
+
+@struct.dataclass
+class Surface:
+    """The ground at points.
+
+    height: `[...]` m.
+    gradient: `[..., 2]` dz/dx and dz/dy in the world frame; 0 across the edge of the map.
+    semantic: `[...]` int32 class id.
+    friction: `[...]` friction coefficient; 0 on soil.
+    """
+
+    height: jax.Array
+    gradient: jax.Array
+    semantic: jax.Array
+    friction: jax.Array
+
+
+def patches(terrain: TerrainMap, position_xy: jax.Array, yaw: jax.Array) -> Patches:
+    """What one vehicle at `[2]` p_world (m) and `[]` yaw (rad) sees, in [-1, 1] (Eq. 1's m_t).
+
+    Pixels are 0.1 m, row 0 farthest ahead, column 0 farthest left, the vehicle midway between
+    the four central ones. Nearest vertex for elevation, containing cell for colour. Pixels off
+    the map take the nearest edge; a NaN pose sees vertex (0, 0) in every pixel. No gradient
+    flows to the pose. Batch with `vmap`, selecting each vehicle's world inside.
+    """
+    pixel = PATCH_METRES / PATCH_PIXELS
+    offset = ((PATCH_PIXELS - 1) / 2 - jnp.arange(PATCH_PIXELS)) * pixel
+    ahead, left = offset[:, None], offset[None, :]
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    x = position_xy[0] + cos * ahead - sin * left
+    y = position_xy[1] + sin * ahead + cos * left
+    column, row = _grid_coordinates(terrain, x, y)
+
+    _, rows, columns = terrain.elevation.shape
+    nearest = _flat_index(
+        terrain, rows, columns, (row + 0.5).astype(jnp.int32), (column + 0.5).astype(jnp.int32)
+    )
+    low, high = terrain.elevation_range
+    elevation = 2 * (_gather(terrain.elevation, nearest) - low) / (high - low) - 1
+    palette = jnp.clip(terrain.class_rgb.astype(jnp.float32) / 127.5 - 1, -1, 1)
+    semantic = _gather(terrain.semantic, _cell_index(terrain, row, column)).astype(jnp.int32)
+    rgb = palette.at[semantic].get(mode="promise_in_bounds")
+    return Patches(jnp.clip(elevation, -1, 1), rgb)
+
+
+def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
+    """The ground as wheels meet it at points `[..., 2]` p_world, m.
+
+    Between vertices, soil is bilinear and rigid ground is two triangles split from bottom left
+    to top right, as Chrono builds them. Differentiable: the gradient of `height` with respect
+    to `xy` is `gradient`.
+    """
+    column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
+    cell = _cell_index(terrain, row, column)
+    semantic = _gather(terrain.semantic, cell).astype(jnp.int32)
+    soft = terrain.deformable.at[semantic].get(mode="promise_in_bounds")
+    bottom_left, along, up, twist, fx, fy = _corners(terrain, row, column)
+    rising = fx > fy
+    height = (
+        bottom_left
+        + fx * along
+        + fy * up
+        # With the minimum instead of the product, the same formula is the two triangles.
+        + twist * jnp.where(soft, fx * fy, jnp.where(rising, fy, fx))
+    )
+    slope_x = along + twist * jnp.where(soft, fy, jnp.where(rising, 0.0, 1.0))
+    slope_y = up + twist * jnp.where(soft, fx, jnp.where(rising, 1.0, 0.0))
+    gradient = jnp.stack([slope_x, slope_y], axis=-1) / terrain.resolution
+    gradient = jnp.where(_inside(terrain, xy), gradient, 0.0)
+    return Surface(height, gradient, semantic, _gather(terrain.friction, cell))
+
+
+def height(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
+    """`[..., 2]` p_world to `[...]` bilinear height, m, whatever the class."""
+    column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
+    bottom_left, along, up, twist, fx, fy = _corners(terrain, row, column)
+    return bottom_left + fx * along + fy * up + twist * fx * fy
+
+
+def normal(gradient: jax.Array) -> jax.Array:
+    """`[..., 2]` gradient to the `[..., 3]` unit normal of the ground, pointing up."""
+    up = jnp.concatenate([-gradient, jnp.ones_like(gradient[..., :1])], axis=-1)
+    return up / jnp.linalg.norm(up, axis=-1, keepdims=True)
+
+
+def footprint_covered(
+    wheel_reach: float, top_speed: float, step_seconds: float = STEP_SECONDS
+) -> None:
+    """Raises unless a patch covers the wheels of the next pose (Sec. III-A), at any heading.
+
+    wheel_reach: m from the body origin to the farthest ground a wheel can touch.
+    top_speed: m/s, the largest in any direction.
+    """
+    needed, covered = wheel_reach + top_speed * step_seconds, PATCH_METRES / 2
+    if not needed <= covered:
+        fastest = (covered - wheel_reach) / step_seconds
+        raise ValueError(
+            f"patch: expected {PATCH_METRES} m to cover the wheels of the next pose, found a reach "
+            f"of {wheel_reach:g} m + {top_speed:g} m/s x {step_seconds:g} s = {needed:g} m "
+            f"> {covered:g} m; keep the top speed below {fastest:g} m/s"
+        )
+
+
+def _grid_coordinates(
+    terrain: TerrainMap, x: jax.Array, y: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Points to fractional (column, row) of the vertices, on the map."""
+    _, rows, columns = terrain.elevation.shape
+    column = (x - terrain.origin[0]) / terrain.resolution
+    row = (terrain.origin[1] - y) / terrain.resolution
+    # `where` and not `clip`: NaN becomes 0, and its gradient too.
+    column = jnp.minimum(jnp.where(column > 0, column, 0.0), columns - 1.0)
+    row = jnp.minimum(jnp.where(row > 0, row, 0.0), rows - 1.0)
+    return column, row
+
+
+def _inside(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
+    """`[..., 2]` whether each coordinate is within the map's extent."""
+    _, rows, columns = terrain.elevation.shape
+    extent = terrain.resolution * jnp.array([columns - 1.0, rows - 1.0])
+    from_corner = (xy - terrain.origin) * jnp.array([1.0, -1.0])
+    return (from_corner >= 0) & (from_corner <= extent)
+
+
+def _flat_index(
+    terrain: TerrainMap, rows: int, columns: int, row: jax.Array, column: jax.Array
+) -> jax.Array:
+    return (terrain.world * rows + row) * columns + column
+
+
+def _gather(raster: jax.Array, index: jax.Array) -> jax.Array:
+    return raster.reshape(-1).at[index].get(mode="promise_in_bounds")
+
+
+def _cell_index(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Array:
+    """The class cell that contains fractional vertex coordinates on the map."""
+    _, rows, columns = terrain.elevation.shape
+    _, cell_rows, cell_columns = terrain.semantic.shape
+    i = jnp.minimum((row * (cell_rows / (rows - 1))).astype(jnp.int32), cell_rows - 1)
+    j = jnp.minimum((column * (cell_columns / (columns - 1))).astype(jnp.int32), cell_columns - 1)
+    return _flat_index(terrain, cell_rows, cell_columns, i, j)
+
+
+def _corners(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> tuple[jax.Array, ...]:
+    """The vertex cell around a point: its corner, edges, twist, and the point's place in it.
+
+    The bilinear height is bottom_left + fx along + fy up + fx fy twist.
+    """
+    _, rows, columns = terrain.elevation.shape
+    r = jnp.minimum(row.astype(jnp.int32), rows - 2)
+    c = jnp.minimum(column.astype(jnp.int32), columns - 2)
+    fx, fy = column - c, 1.0 - (row - r)
+    top = _flat_index(terrain, rows, columns, r, c)
+    bottom = top + columns
+    top_left, top_right = _gather(terrain.elevation, top), _gather(terrain.elevation, top + 1)
+    bottom_left = _gather(terrain.elevation, bottom)
+    bottom_right = _gather(terrain.elevation, bottom + 1)
+    along, up = bottom_right - bottom_left, top_left - bottom_left
+    return bottom_left, along, up, top_right - top_left - along, fx, fy

@@ -1,0 +1,112 @@
+"""The worlds of a Verti-Bench checkout (RobotiXX/verti_bench).
+
+Gray height maps of one vertex a metre, 8 m patches with a class and a friction, and rocks and
+trees. Soils are put where the labels are, which is not where that simulator puts them.
+"""
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from PIL import Image, UnidentifiedImageError
+
+from vertiwm_jax.terrain.classes import STANDARD
+from vertiwm_jax.terrain.map import MapError, TerrainMap, build, stack
+from vertiwm_jax.terrain.worlds import CELLS, HALF_EXTENT, ROCK_SIZE, TREE_SIZE, VERTICES
+
+_FOLDER = Path("envs/data/BenchMaps/sampled_maps")
+
+
+def load(folder: str | Path, numbers: Iterable[int] | None = None) -> TerrainMap:
+    """Worlds of a checkout, stacked: those of `numbers`, in that order, or all, by number.
+
+    Raises `MapError` naming the file and the field.
+    """
+    maps = Path(folder) / _FOLDER
+    if not maps.is_dir():
+        raise MapError(str(folder), "folder", f"a checkout that holds {_FOLDER}", "no such folder")
+    if numbers is None:
+        found = (re.fullmatch(r"(\d+)\.bmp", f.name) for f in (maps / "Worlds").iterdir())
+        numbers = sorted(int(match[1]) for match in found if match)
+    configs = [_config_path(maps, number) for number in numbers]
+    return stack([_world(maps, config) for config in configs], [str(path) for path in configs])
+
+
+def _config_path(maps: Path, number: int) -> Path:
+    found = sorted((maps / "Configs/Final").glob(f"config{number}_*.yaml"))
+    if len(found) != 1:
+        raise MapError(
+            str(maps / "Configs/Final"), f"world {number}",
+            f"one file config{number}_{{low,mid,high}}.yaml", f"{[f.name for f in found]}",
+        )  # fmt: skip
+    return found[0]
+
+
+def _world(maps: Path, path: Path) -> TerrainMap:
+    number = re.match(r"config(\d+)_", path.name)[1]  # type: ignore[index]
+    name = str(path)
+    # The C loader is ten times as fast, where PyYAML was built with it.
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        config = yaml.load(path.read_text(), Loader=loader)
+        max_height = float(config["terrain"]["max_height"])
+        semantic, friction = _patches(config["textures"], name)
+        obstacles = _obstacles(config["obstacles"])
+    except yaml.YAMLError as error:
+        raise MapError(name, "file", "YAML", " ".join(str(error).split())) from None
+    except (KeyError, TypeError) as error:
+        raise MapError(name, "file", "Verti-Bench's fields", f"no {error}") from None
+    return build(
+        _gray(maps / "Worlds" / f"{number}.bmp") * (max_height / 255),
+        semantic,
+        friction,
+        obstacles,
+        resolution=1.0,
+        # The look-ups of Verti-Bench use half a size of 64.5 m: half a metre off its own ground.
+        origin=(-HALF_EXTENT, HALF_EXTENT),
+        name=name,
+    )
+
+
+def _gray(path: Path) -> np.ndarray:
+    try:
+        with Image.open(path) as image:
+            gray = np.asarray(image.convert("L"), np.float32)
+    except (OSError, UnidentifiedImageError) as error:
+        raise MapError(str(path), "elevation", "an 8-bit gray BMP", str(error)) from None
+    if gray.shape != (VERTICES, VERTICES):
+        raise MapError(str(path), "elevation", f"{VERTICES} x {VERTICES} pixels", f"{gray.shape}")
+    return gray
+
+
+def _patches(textures: list[dict[str, Any]], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """`[16, 16]` class ids and friction; index [i, j] counts i from +y and j from -x."""
+    semantic = np.full((CELLS, CELLS), -1)
+    friction = np.zeros((CELLS, CELLS), np.float32)
+    for texture in textures:
+        i, j = texture["index"]
+        kind = texture["terrain_type"]
+        if kind not in STANDARD.names:
+            expected = f"one of {', '.join(STANDARD.names)}"
+            raise MapError(name, f"textures [{i}, {j}].terrain_type", expected, f"{kind}")
+        if not (0 <= i < CELLS and 0 <= j < CELLS):
+            raise MapError(name, "textures.index", f"0 to {CELLS - 1}", f"[{i}, {j}]")
+        semantic[i, j] = STANDARD.names.index(kind)
+        if kind not in STANDARD.soils:
+            friction[i, j] = texture["friction"]
+    missing = np.argwhere(semantic < 0)
+    if len(missing):
+        found = f"{len(missing)} missing, the first at index {missing[0].tolist()}"
+        raise MapError(name, "textures", f"all {CELLS} x {CELLS} patches", found)
+    return semantic, friction
+
+
+def _obstacles(config: dict[str, list[dict[str, Any]]]) -> np.ndarray:
+    """`[N, 5]`; their stored heights above the ground's datum are wrong and not used."""
+    rocks = [(r["position"], r["scale"] * np.array(ROCK_SIZE)) for r in config["rocks"]]
+    trees = [(t["position"], np.array(TREE_SIZE)) for t in config["trees"]]
+    rows = [(place["x"], place["y"], *size) for place, size in rocks + trees]
+    return np.array(rows, np.float32).reshape(-1, 5)

@@ -1,0 +1,291 @@
+"""Procedural worlds, drawn on the device from keys: relief, ground classes, obstacles.
+
+The scale is Verti-Bench's: 128 m x 128 m, one vertex a metre, 8 m class cells, and presets of
+difficulty with the median slope of its low, mid and high worlds, and one beyond.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import cycle, islice, product
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vertiwm_jax.terrain.classes import FIRST_DEFORMABLE, FRICTION_LIMITS, STANDARD
+from vertiwm_jax.terrain.map import ELEVATION_RANGE, TerrainMap
+
+VERTICES = 129
+RESOLUTION = 1.0
+CELLS = 16
+HALF_EXTENT = 64.0
+START_RADIUS = 60.0
+"""Starts and goals lie on a circle of this radius about the centre, m."""
+START_CLEARANCE = 6.0
+"""No obstacle comes nearer to that circle than this, m."""
+ROCK_SIZE = (4.4, 4.4, 3.8)
+TREE_SIZE = (1.0, 1.0, 5.0)
+
+Difficulty = Literal["low", "mid", "high", "extreme"]
+Kind = Literal["rigid", "deformable", "mixed"]
+
+MEDIAN_SLOPE_DEG: dict[Difficulty, float] = {"low": 5.8, "mid": 11.5, "high": 17.7, "extreme": 25.0}
+"""Median slope of the triangles of the ground; the first three are measured on Verti-Bench."""
+
+_KINDS: tuple[Kind, ...] = get_args(Kind)
+_SLOPE_SPREAD = 0.1
+_FFT_PERIOD = 256  # the smallest power of two that holds the map without wrapping around
+_VORONOI_CELLS = 10
+
+
+@dataclass(frozen=True)
+class ReliefConfig:
+    """Shape of the ground, before it is scaled to its median slope. Pairs are drawn between.
+
+    exponent: fall of the amplitude spectrum of the roughness with spatial frequency; larger is
+        smoother.
+    shortest, longest: wavelengths of the roughness, m.
+    patchiness: standard deviation of the logarithm of the roughness from place to place; what
+        makes steep spots steeper than those of even ground of the same median slope.
+    hills: largest height of hills of 25 to 130 m, in multiples of the roughness' scale.
+    ridges: largest number of ridges and ditches.
+    clearing: probability of a nearly level clearing.
+    """
+
+    exponent: tuple[float, float] = (0.6, 1.4)
+    shortest: tuple[float, float] = (2.2, 3.5)
+    longest: tuple[float, float] = (20.0, 60.0)
+    patchiness: float = 0.4
+    hills: float = 5.0
+    ridges: int = 4
+    clearing: float = 0.4
+
+
+@dataclass(frozen=True)
+class WorldConfig:
+    """What to draw. Worlds cycle through all pairs of a difficulty and a kind, in `labels` order.
+
+    difficulties: preset names, or median slopes in degrees.
+    kinds: rigid ground, soil, or rectangles of soil in rigid ground.
+    rocks, trees: how many of each stand in every world.
+    """
+
+    difficulties: tuple[Difficulty | float, ...] = ("low", "mid", "high")
+    kinds: tuple[Kind, ...] = ("rigid", "deformable", "mixed")
+    rocks: int = 0
+    trees: int = 0
+    relief: ReliefConfig = ReliefConfig()
+
+    def __post_init__(self) -> None:
+        for difficulty in self.difficulties:
+            if isinstance(difficulty, str) and difficulty not in MEDIAN_SLOPE_DEG:
+                raise ValueError(
+                    f"WorldConfig: difficulties: expected one of {', '.join(MEDIAN_SLOPE_DEG)} or "
+                    f"a median slope in degrees, found {difficulty!r}"
+                )
+            if not isinstance(difficulty, str) and not 0 <= difficulty < 60:
+                raise ValueError(
+                    f"WorldConfig: difficulties: expected a median slope of 0 to 60 deg, "
+                    f"found {difficulty}"
+                )
+        for kind in self.kinds:
+            if kind not in _KINDS:
+                raise ValueError(
+                    f"WorldConfig: kinds: expected one of {', '.join(_KINDS)}, found {kind!r}"
+                )
+        if not (self.difficulties and self.kinds):
+            raise ValueError("WorldConfig: expected a difficulty and a kind or more, found none")
+
+
+def labels(config: WorldConfig, count: int) -> list[tuple[Difficulty | float, Kind]]:
+    """The difficulty and kind of each of `count` worlds."""
+    pairs = product(config.kinds, config.difficulties)
+    return [(difficulty, kind) for kind, difficulty in islice(cycle(pairs), count)]
+
+
+def generate(keys: jax.Array, config: WorldConfig) -> TerrainMap:
+    """Draws one world for each of the typed keys `[W]`, on the device; deterministic."""
+    drawn = labels(config, len(keys))
+    slope = [d if isinstance(d, float | int) else MEDIAN_SLOPE_DEG[d] for d, _ in drawn]
+    kind = [_KINDS.index(k) for _, k in drawn]
+    worlds = _worlds(
+        keys,
+        jnp.array(slope, jnp.float32),
+        jnp.array(kind, jnp.int32),
+        config.relief,
+        config.rocks,
+        config.trees,
+    )
+    elevation, semantic, friction, obstacles = worlds
+    return TerrainMap(
+        elevation=elevation,
+        semantic=semantic,
+        friction=friction,
+        obstacles=obstacles,
+        origin=jnp.array([-HALF_EXTENT, HALF_EXTENT], jnp.float32),
+        resolution=jnp.float32(RESOLUTION),
+        elevation_range=jnp.array(ELEVATION_RANGE, jnp.float32),
+        class_rgb=jnp.asarray(STANDARD.rgb),
+        deformable=jnp.asarray(STANDARD.deformable),
+        soils=STANDARD.stacked_soils(),
+        world=jnp.int32(0),
+        class_names=STANDARD.names,
+    )
+
+
+@partial(jax.jit, static_argnames=("relief", "rocks", "trees"))
+def _worlds(
+    keys: jax.Array,
+    slope_deg: jax.Array,
+    kind: jax.Array,
+    relief: ReliefConfig,
+    rocks: int,
+    trees: int,
+) -> tuple[jax.Array, ...]:
+    def world(inputs: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        key, slope_deg, kind = inputs
+        relief_key, class_key, friction_key, obstacle_key = jax.random.split(key, 4)
+        semantic = _classes(class_key, kind)
+        return (
+            _relief(relief_key, slope_deg, relief),
+            semantic,
+            _friction(friction_key, semantic),
+            _obstacles(obstacle_key, rocks, trees),
+        )
+
+    # One after the other: `vmap` would be no faster, compile twice as long, and take W times the
+    # memory for the transforms.
+    return jax.lax.map(world, (keys, slope_deg, kind))
+
+
+def _relief(key: jax.Array, slope_deg: jax.Array, config: ReliefConfig) -> jax.Array:
+    """`[129, 129]` heights from 0 up, m, whose triangles have the median slope, give or take."""
+    noise_key, ridge_key, scalar_key = jax.random.split(key, 3)
+    # One draw for all scalars: every call of the generator costs compile time.
+    uniform = iter(jax.random.uniform(scalar_key, (9,)))
+
+    def between(low: float, high: float) -> jax.Array:
+        return low + (high - low) * next(uniform)
+
+    exponents = (between(*config.exponent), 1.0, 2.0)
+    shortest = (between(*config.shortest), 12.0, 25.0)
+    longest = (between(*config.longest), 60.0, 130.0)
+    rough, patches, hills = _noises(noise_key, exponents, shortest, longest)
+    rough = rough / _median_slope(rough) * jnp.exp(config.patchiness * patches)
+    # Squared, so that most worlds are rough and some are rolling.
+    hills = config.hills * between(0, 1) ** 2 * hills
+    axis = jnp.arange(VERTICES) * RESOLUTION - HALF_EXTENT
+    x, y = axis[None, :], -axis[:, None]
+    ridges = _ridges(ridge_key, x, y, config.ridges)
+
+    squared = (x - between(-40, 40)) ** 2 + (y - between(-40, 40)) ** 2
+    inside = jnp.exp(-((squared / between(10, 25) ** 2) ** 2))
+    level = jnp.where(between(0, 1) < config.clearing, 0.85, 0.0) * inside
+    heights = (rough + ridges) * (1 - level) + hills
+
+    slope = jnp.tan(jnp.deg2rad(slope_deg)) * between(1 - _SLOPE_SPREAD, 1 + _SLOPE_SPREAD)
+    heights *= slope / _median_slope(heights)
+    heights -= jnp.min(heights)
+    # Rarely, long steep hills would leave the range that elevation patches are scaled by.
+    return heights * jnp.minimum(1.0, ELEVATION_RANGE[1] / jnp.maximum(jnp.max(heights), 1e-6))
+
+
+def _noises(
+    key: jax.Array,
+    exponents: Sequence[jax.Array | float],
+    shortest: Sequence[jax.Array | float],
+    longest: Sequence[jax.Array | float],
+) -> jax.Array:
+    """`[n, 129, 129]` fields of power-law noise between two wavelengths in m, of unit deviation."""
+    axis = np.fft.fftfreq(_FFT_PERIOD, RESOLUTION)
+    frequency = np.hypot(axis[:, None], axis[None, :])
+    frequency[0, 0] = 1e-3  # outside every band; keeps the power finite
+    exponent, low, high = (
+        jnp.stack([jnp.asarray(x, jnp.float32) for x in values])[:, None, None]
+        for values in (exponents, shortest, longest)
+    )
+    band = (frequency > 1 / high) & (frequency < 1 / low)
+    amplitude = jnp.where(band, frequency**-exponent, 0.0)
+    phase = jax.random.uniform(key, amplitude.shape, maxval=2 * np.pi)
+    fields = jnp.fft.ifft2(amplitude * jnp.exp(1j * phase)).real[:, :VERTICES, :VERTICES]
+    return fields / jnp.std(fields, axis=(1, 2), keepdims=True)
+
+
+def _median_slope(heights: jax.Array) -> jax.Array:
+    """Median slope (a tangent) of the lower triangles of all cells."""
+    right = heights[1:, 1:] - heights[1:, :-1]
+    up = heights[:-1, 1:] - heights[1:, 1:]
+    return jnp.median(jnp.hypot(right, up)) / RESOLUTION
+
+
+def _ridges(key: jax.Array, x: jax.Array, y: jax.Array, most: int) -> jax.Array:
+    """The sum of 0 to `most` straight ridges (up) and ditches (down) over points x, y."""
+    low = jnp.array([0, -50, -40, 1.2, 15, -4])
+    high = jnp.array([2 * np.pi, 50, 40, 5, 60, 4])
+    drawn = jax.random.uniform(key, (most, 6), minval=low, maxval=high)
+    angle, offset, middle, width, length, rise = jnp.moveaxis(drawn, 1, 0)[..., None, None]
+    across = (x * jnp.cos(angle) + y * jnp.sin(angle) - offset) / width
+    along = (y * jnp.cos(angle) - x * jnp.sin(angle) - middle) / length
+    # Those that would rise or fall by little are left out.
+    rise = jnp.where(jnp.abs(rise) > 1.5, rise, 0.0)
+    return jnp.sum(rise * jnp.exp(-(across**2) - along**4), axis=0)
+
+
+def _classes(key: jax.Array, kind: jax.Array) -> jax.Array:
+    """`[16, 16]` class ids: Voronoi cells of one to all classes; soil in rectangles if mixed."""
+    names = len(STANDARD.names)
+    soils = names - FIRST_DEFORMABLE
+    order_key, other_key = jax.random.split(key)
+    order = jax.random.uniform(order_key, (names,))
+    rigid_order = jnp.argsort(order[:FIRST_DEFORMABLE])
+    soil_order = FIRST_DEFORMABLE + jnp.argsort(order[FIRST_DEFORMABLE:])
+    drawn = jax.random.uniform(other_key, (2 + 2 * _VORONOI_CELLS + 4 * soils,))
+    counts, centres, size, corner = jnp.split(
+        drawn, [2, 2 + 2 * _VORONOI_CELLS, 2 + 2 * _VORONOI_CELLS + 2 * soils]
+    )
+    rigid_count, soil_count = 1 + (counts * jnp.array([FIRST_DEFORMABLE, soils])).astype(jnp.int32)
+
+    centres = CELLS * centres.reshape(_VORONOI_CELLS, 2)
+    i, j = jnp.mgrid[:CELLS, :CELLS]
+    squared = (i[..., None] + 0.5 - centres[:, 0]) ** 2 + (j[..., None] + 0.5 - centres[:, 1]) ** 2
+    cell = jnp.argmin(squared, axis=-1)
+    rigid, soil = rigid_order[cell % rigid_count], soil_order[cell % soil_count]
+
+    # Sides of 3 to 8 cells: one soil covers 3.5 % of the ground at least.
+    size = 3 + (6 * size.reshape(soils, 2)).astype(jnp.int32)
+    corner = (corner.reshape(soils, 2) * (CELLS + 1 - size)).astype(jnp.int32)
+    mixed = rigid
+    for k in range(soils):
+        (top, left), (tall, wide) = corner[k], size[k]
+        covered = (i >= top) & (i < top + tall) & (j >= left) & (j < left + wide)
+        mixed = jnp.where(covered & (k < soil_count), soil_order[k], mixed)
+    return jnp.stack([rigid, soil, mixed])[kind].astype(jnp.uint8)
+
+
+def _friction(key: jax.Array, semantic: jax.Array) -> jax.Array:
+    """A friction coefficient for each cell of rigid ground; 0 on soil."""
+    mean = jnp.asarray(STANDARD.friction)[semantic]
+    deviation = jnp.asarray(STANDARD.friction_deviation)[semantic]
+    drawn = mean + deviation * jax.random.normal(key, semantic.shape)
+    return jnp.where(semantic < FIRST_DEFORMABLE, jnp.clip(drawn, *FRICTION_LIMITS), 0.0)
+
+
+def _obstacles(key: jax.Array, rocks: int, trees: int) -> jax.Array:
+    """`[rocks + trees, 5]` boxes anywhere on the map but near the circle of starts and goals."""
+    drawn = jax.random.uniform(key, (rocks + trees, 4))
+    scale = 0.7 + 0.5 * drawn[:rocks, :1]
+    sizes = jnp.concatenate(
+        [scale * jnp.array(ROCK_SIZE), jnp.broadcast_to(jnp.array(TREE_SIZE), (trees, 3))]
+    )
+    reach = jnp.linalg.norm(sizes[:, :2], axis=-1) / 2
+    edge = HALF_EXTENT - reach[:, None]
+    place = edge * (2 * drawn[:, 1:3] - 1)
+    radius = jnp.linalg.norm(place, axis=-1)
+    blocking = jnp.abs(radius - START_RADIUS) < START_CLEARANCE + reach
+    # Those that would block the circle go inside it instead, in the same direction.
+    inner = START_RADIUS - START_CLEARANCE - reach
+    inner *= jnp.sqrt(drawn[:, 3])
+    place *= jnp.where(blocking, inner / jnp.maximum(radius, 1e-6), 1.0)[:, None]
+    return jnp.concatenate([place, sizes], axis=-1)
