@@ -3,7 +3,7 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from vertiwm_jax.evaluation.controllers import RandomActions, StraightToGoal
 from vertiwm_jax.evaluation.navigation import NavigationResult, evaluate
 from vertiwm_jax.mechanics.simulator import Simulator, SimulatorParams
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.rl import ground
+from vertiwm_jax.rl import checkpoints, ground
 from vertiwm_jax.rl.checkpoints import CheckpointError
 from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.rl.loop import LoopConfig, TrainingError, TrainingInterrupted, train
@@ -49,7 +49,7 @@ class TrainConfig:
     runs: Path = Path("runs")
     """Folder in which the folder of this run is made."""
     resume: Path | None = None
-    """Folder of an earlier run to go on with, under its own configuration."""
+    """Folder of an earlier run to go on with; its configuration holds, save what is set beside."""
     compile_cache: Path | None = None
     """Folder that keeps compiled programs for later runs."""
     ground: GroundConfig = GroundConfig()
@@ -73,9 +73,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(stopped)
         sys.exit(130)
     except KeyboardInterrupt:
-        print("stopped; the newest checkpoint is good, go on from it with --resume and the run")
+        print("stopped at once; go on from the newest checkpoint with --resume and the run folder")
         sys.exit(130)
-    except (ValueError, RunError, CheckpointError, TrainingError) as error:
+    except (RunError, CheckpointError, TrainingError) as error:
         sys.exit(f"error: {error}")
     print(f"all of it is in {run_folder}")
 
@@ -98,38 +98,45 @@ def _configuration(argv: Sequence[str] | None) -> TrainConfig:
     return configuration.parse(TrainConfig, file, argv, "python -m vertiwm_jax.ppo")
 
 
+def environment(config: TrainConfig) -> tuple[NavigationEnv, NavigationParams, NavigationParams]:
+    """The environment, its parameters to train with, and those to test with."""
+    world_key, task_key = jax.random.split(jax.random.key(config.seed))
+    env = NavigationEnv(config.simulator, config.navigation)
+    params = SimulatorParams(hmmwv())
+    terrain, held_out = ground.grounds(config.ground, config.worlds, world_key)
+    chassis = config.navigation.chassis
+    tasks = ground.training_tasks(config.ground, terrain, chassis, task_key)
+    test_tasks = ground.test_tasks(config.ground, held_out)
+    return (
+        env,
+        env.make_params(params, terrain, tasks),
+        env.make_params(params, held_out, test_tasks),
+    )
+
+
 def _train_and_report(config: TrainConfig) -> Path:
     if config.compile_cache:
         jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
-    world_key, task_key, train_key, test_key = jax.random.split(jax.random.key(config.seed), 4)
-    terrain, held_out = ground.grounds(config.ground, config.worlds, world_key)
-    env = NavigationEnv(config.simulator, config.navigation)
-    chassis = config.navigation.chassis
-    tasks = ground.training_tasks(config.ground, terrain, chassis, task_key)
-    vehicle = SimulatorParams(hmmwv())
-    env_params = env.make_params(vehicle, terrain, tasks)
-    test = env.make_params(vehicle, held_out, ground.test_tasks(config.ground, held_out))
-
+    try:
+        env, params, test = environment(config)
+    except ValueError as error:  # what is wrong with the maps, or with the tasks on them
+        sys.exit(f"error: {error}")
     algorithm = PPO(env, config.ppo, outcomes)
+    train_key, test_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1))
+    iterations, batch = config.ppo.iterations, config.ppo.batch
     with _open(config) as run:
-        print(f"run folder {run.folder}: {terrain.worlds} worlds to train on")
-        state = train(
-            algorithm,
-            env_params,
-            train_key,
-            run,
-            config.ppo.iterations,
-            config.ppo.batch,
-            config.loop,
-        )
+        print(f"run folder {run.folder}; training on {params.terrain.worlds} worlds", flush=True)
+        state = train(algorithm, params, train_key, run, iterations, batch, config.loop)
+        seeds = range(config.loop.seeds)
         policies = {
-            "ppo" if config.loop.seeds == 1 else f"ppo, seed {seed}": algorithm.policy(
-                env_params, jax.tree.map(lambda x, seed=seed: x[seed], state)
+            "ppo" if len(seeds) == 1 else f"ppo, seed {seed}": algorithm.policy(
+                params, jax.tree.map(lambda x, seed=seed: x[seed], state)
             )
-            for seed in range(config.loop.seeds)
+            for seed in seeds
         }
         policies |= {REFERENCE: StraightToGoal(config.navigation), "random": RandomActions()}
-        print(f"driving {test.pool_size} tasks on {held_out.worlds} worlds not trained on ...")
+        tested = f"{test.pool_size} tasks on {test.terrain.worlds} worlds not trained on"
+        print(f"driving {tested} ...", flush=True)
         results = {name: evaluate(env, test, p, test_key) for name, p in policies.items()}
         _report(run, config, test, results)
     return run.folder
@@ -138,8 +145,6 @@ def _train_and_report(config: TrainConfig) -> Path:
 def _open(config: TrainConfig) -> Run:
     if config.resume is None:
         return Run.create(config.runs, "ppo", config)
-    from vertiwm_jax.rl import checkpoints
-
     newest = checkpoints.latest(config.resume / "checkpoints")
     return Run.open(config.resume, int(newest.name) if newest else 0)
 
@@ -157,20 +162,27 @@ def _report(
     numbers = json.dumps(report.summary(groups, REFERENCE), indent=2)
     runs.write_atomic(run.folder / "summary.json", numbers + "\n")
 
+    _draw(run, config, test, groups)
+
+
+def _draw(
+    run: Run, config: TrainConfig, test: NavigationParams, groups: Mapping[str, report.Results]
+) -> None:
+    """Learning curves, and for each difficulty a drive to a goal that is hard to reach."""
     metrics = runs.read_metrics(run.folder)
-    columns = {name: [line.get(name, np.nan) for line in metrics] for name in metrics[-1]}
+    names = dict.fromkeys(name for line in metrics for name in line)
+    columns = {name: [line.get(name, np.nan) for line in metrics] for name in names}
     labels = {name: label for name, label in CURVES.items() if name in columns}
     figure = plots.learning_curves({"ppo": columns}, "transitions", labels, "transitions")
     figure.savefig(run.folder / "learning_curves.png")
-    for name, group in groups.items():
-        first = next(iter(group.values()))
-        world = int(first.world[0])
-        drives = {policy: result.path(0) for policy, result in group.items()}
+    for name, results in groups.items():
+        reference = results[REFERENCE]
+        task = int(np.argmin(reference.success))  # the first failure, if there is one
         figure = plots.trajectories(
             test.terrain,
-            world,
-            drives,
-            np.asarray(first.goal[0]),
+            int(reference.world[task]),
+            {policy: result.path(task) for policy, result in results.items()},
+            np.asarray(reference.goal[task]),
             config.navigation.goal_radius,
             STEP_SECONDS,
         )

@@ -79,12 +79,12 @@ def test_vector_resets_in_the_step_that_ends(short):
 
 def test_vector_agrees_with_single(short):
     env, params = short
-    vector = NavigationVectorEnv(env, params, num_envs=2)
+    vector = NavigationVectorEnv(env, params, num_envs=4)
     vector.reset(seed=0)
     states, step = vector._state, jax.jit(env.step_env)
-    action = np.array([[0.3, -0.6], [1.0, 0.2]], np.float32)
+    action = np.array([[0.3, -0.6], [1.0, 0.2], [-1.0, 0.0], [0.0, 1.0]], np.float32)
     observation, reward, *_ = vector.step(action)
-    for i in range(2):
+    for i in range(4):
         state = jax.tree.map(lambda x, i=i: x[i], states)
         expected = step(jax.random.key(0), state, action[i], params)
         np.testing.assert_allclose(observation[i], expected[0], atol=1e-5)

@@ -15,6 +15,10 @@ from vertiwm_jax.terrain import map as terrain_map
 
 KEY = jax.random.key(0)
 AHEAD = jnp.array([1.0, 0.0])
+# Equal environments share what it compiles.
+STEP = jax.jit(NavigationEnv.step_env, static_argnums=0)
+BLOCKED = ground(obstacles=[[9.0, 0.0, 2.0, 2.0, 1.0]])
+OPEN = ground(obstacles=[[9.0, 50.0, 2.0, 2.0, 1.0]])
 
 
 def drive(x, y=0.0, z=0.47, roll=0.0, speed=4.0):
@@ -29,16 +33,15 @@ def drive(x, y=0.0, z=0.47, roll=0.0, speed=4.0):
     )
 
 
-def play(script, steps, terrain=None, goal=(30.0, 0.0), **settings):
+def play(script, steps, terrain=OPEN, goal=(30.0, 0.0), **settings):
     """Outputs of `steps` steps of a script that starts at (0, 0)."""
     config = NavigationConfig(**settings)
     env = NavigationEnv(Scripted(config.settle_steps), config)
-    params = env.make_params(script, terrain or ground(), task((0.0, 0.0), goal))
-    step = jax.jit(env.step_env)
+    params = env.make_params(script, terrain, task((0.0, 0.0), goal))
     _, state = env.start(params, 0)
     outputs = []
     for _ in range(steps):
-        observation, state, reward, terminated, info = step(KEY, state, AHEAD, params)
+        observation, state, reward, terminated, info = STEP(env, KEY, state, AHEAD, params)
         truncated = env.is_truncated(state, params)
         outputs.append((observation, state, reward, bool(terminated), bool(truncated), info))
     return outputs
@@ -62,9 +65,7 @@ def endings(outputs):
     ],
 )
 def test_every_fault_ends_the_task(script, ending):
-    obstacle = ground(obstacles=[[9.0, 0.0, 2.0, 2.0, 1.0]])
-    terrain = obstacle if ending == "COLLIDED" else None
-    outputs = play(script, 2, terrain)
+    outputs = play(script, 2, BLOCKED if ending == "COLLIDED" else OPEN)
     assert endings(outputs) == ["RUNNING", ending]
     assert [(o[3], o[4]) for o in outputs] == [(False, False), (True, False)]
 

@@ -67,6 +67,12 @@ def test_no_obstacles_no_collision():
     assert not obstacles.height_above_ground(terrain, xy).any()
 
 
+def test_a_nan_pose_touches_nothing():
+    terrain = build(np.array([[0, 0, 30, 30, 1]]))
+    poses = jnp.array([[np.nan, 0], [0, 0], [0, 0]]), jnp.array([0, np.nan, 0])
+    assert obstacles.collides(terrain, *poses, 4, 2).tolist() == [False, False, True]
+
+
 def test_unused_rows_are_no_obstacles_and_worlds_are_apart():
     terrain = terrain_map.stack([build(np.zeros((0, 5))), build(BOXES)])
     at = jax.vmap(lambda w: obstacles.collides(terrain.select(w), jnp.zeros(2), 0.0, 1.0, 1.0))

@@ -81,6 +81,7 @@ def test_what_is_wrong_with_a_checkout_is_named(checkout, tmp_path):
         ("max_height", "height", r"file: expected Verti-Bench's fields, found no 'max_height'"),
         ("friction: 0.3\n", "f: 1\n", r"file: .* found no 'friction'"),
         ("- 0\n  - 0\n", "- 0\n  - 1\n", r"textures: .*1 missing, the first at index \[0, 0\]"),
+        ("max_height: 4.8", "max_height: tall", r"file: .* one ill-typed: .*'tall'"),
         ("terrain:", "terrain: [", r"file: expected YAML"),
     ):
         assert old in text

@@ -1,5 +1,6 @@
 """Navigation for code that expects Gymnasium: one vehicle, or many at once."""
 
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -23,6 +24,45 @@ def _spaces(env: NavigationEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.
     )
 
 
+# Equal environments share what these compile.
+@partial(jax.jit, static_argnames="env")
+def _reset(
+    env: NavigationEnv, key: jax.Array, params: NavigationParams
+) -> tuple[jax.Array, NavigationState]:
+    return env.reset_env(key, params)
+
+
+@partial(jax.jit, static_argnames="env")
+def _step(
+    env: NavigationEnv,
+    key: jax.Array,
+    state: NavigationState,
+    action: jax.Array,
+    params: NavigationParams,
+) -> tuple[Any, ...]:
+    result = env.step_env(jax.random.fold_in(key, state.time), state, action, params)
+    return *result, env.is_truncated(result[1], params)
+
+
+@partial(jax.jit, static_argnames=("env", "count"))
+def _reset_all(
+    env: NavigationEnv, key: jax.Array, params: NavigationParams, count: int
+) -> tuple[jax.Array, NavigationState]:
+    return jax.vmap(env.reset, (0, None))(jax.random.split(key, count), params)
+
+
+@partial(jax.jit, static_argnames="env")
+def _step_all(
+    env: NavigationEnv,
+    key: jax.Array,
+    states: NavigationState,
+    actions: jax.Array,
+    params: NavigationParams,
+) -> tuple[Any, ...]:
+    keys = jax.random.split(key, len(actions))
+    return jax.vmap(env.step, (0, 0, 0, None))(keys, states, actions, params)
+
+
 class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One vehicle; passes `gymnasium.utils.env_checker.check_env`.
 
@@ -39,16 +79,6 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space, self.action_space = _spaces(env)
         self.render_mode = render_mode
         self._env, self._params = env, params
-        self._reset = jax.jit(env.reset_env)
-
-        @jax.jit
-        def step(
-            key: jax.Array, state: NavigationState, action: jax.Array, params: NavigationParams
-        ) -> tuple[Any, ...]:
-            result = env.step_env(jax.random.fold_in(key, state.time), state, action, params)
-            return *result, env.is_truncated(result[1], params)
-
-        self._step = step
         self._state: NavigationState | None = None
 
     def reset(
@@ -57,15 +87,15 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """A start drawn from the pool; there are no options."""
         super().reset(seed=seed)
         self._key = jax.random.key(self.np_random.integers(2**31))
-        observation, self._state = self._reset(self._key, self._params)
+        observation, self._state = _reset(self._env, self._key, self._params)
         return np.asarray(observation), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One step of 0.1 s, without reset at the end."""
         if self._state is None:
             raise gymnasium.error.ResetNeeded("step: call reset() first")
-        observation, self._state, reward, terminated, info, truncated = self._step(
-            self._key, self._state, action, self._params
+        observation, self._state, reward, terminated, info, truncated = _step(
+            self._env, self._key, self._state, action, self._params
         )
         info = {name: value.item() for name, value in info.items()}
         return np.asarray(observation), reward.item(), bool(terminated), bool(truncated), info
@@ -100,9 +130,7 @@ class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.single_observation_space, self.single_action_space = _spaces(env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._params = params
-        self._reset = jax.jit(jax.vmap(env.reset, (0, None)))
-        self._step = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))
+        self._env, self._params = env, params
         self._state: NavigationState | None = None
 
     def reset(
@@ -111,7 +139,8 @@ class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """New starts for all vehicles, drawn from the pool; there are no options."""
         super().reset(seed=seed)
         self._key = jax.random.key(self.np_random.integers(2**31))
-        observation, self._state = self._reset(self._next_keys(), self._params)
+        key = self._next_key()
+        observation, self._state = _reset_all(self._env, key, self._params, self.num_envs)
         return np.array(observation), {}
 
     def step(
@@ -120,8 +149,8 @@ class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """One step of 0.1 s; ended vehicles return the first observation of their next episode."""
         if self._state is None:
             raise gymnasium.error.ResetNeeded("step: call reset() first")
-        observation, self._state, *outcome = self._step(
-            self._next_keys(), self._state, actions, self._params
+        observation, self._state, *outcome = _step_all(
+            self._env, self._next_key(), self._state, actions, self._params
         )
         # Copies, since arrays of JAX are read-only.
         reward, terminated, truncated, info = jax.tree.map(np.array, outcome)
@@ -136,9 +165,9 @@ class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             infos |= _with_masks({"final_obs": final, "final_info": _with_masks(info, over)}, over)
         return np.array(observation), reward, terminated, truncated, infos
 
-    def _next_keys(self) -> jax.Array:
-        self._key, now = jax.random.split(self._key)
-        return jax.random.split(now, self.num_envs)
+    def _next_key(self) -> jax.Array:
+        self._key, key = jax.random.split(self._key)
+        return key
 
 
 def _with_masks(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:

@@ -30,17 +30,22 @@ def markdown(groups: Mapping[str, Results], reference: str) -> str:
 
 
 def summary(groups: Mapping[str, Results], reference: str) -> dict[str, Any]:
-    """The same as plain numbers, for JSON."""
+    """The same as plain numbers, for JSON; what has no value is None."""
     return {
         name: {
             policy: {
-                **dataclasses.asdict(Summary.of(result)),
+                **_plain(Summary.of(result)),
                 "solved_of_reference_failures": _rescued(result, results[reference]),
             }
             for policy, result in results.items()
         }
         for name, results in groups.items()
     }
+
+
+def _plain(row: Summary) -> dict[str, Any]:
+    values = dataclasses.asdict(row)
+    return {name: None if value != value else value for name, value in values.items()}
 
 
 def _section(name: str, results: Results, reference: str) -> str:

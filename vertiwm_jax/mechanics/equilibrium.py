@@ -18,7 +18,7 @@ def equilibrium_sinkage(
     velocity_y: Scalar,
     omega: Scalar,
     rut: Scalar = 0.0,
-    nodes: int = 8,
+    nodes: int = 6,
 ) -> jax.Array:
     """Sinkage in m at which the normal force equals `load` in N, all `[...]`.
 
@@ -28,9 +28,7 @@ def equilibrium_sinkage(
     """
 
     def unbalanced(sinkage: jax.Array) -> jax.Array:
-        wrench = forces(
-            wheel, soil, contact, sinkage, velocity_x, velocity_y, omega, rut, nodes
-        )
+        wrench = forces(wheel, soil, contact, sinkage, velocity_x, velocity_y, omega, rut, nodes)
         return wrench.normal - load
 
     def bisect(residual, low: jax.Array) -> jax.Array:

@@ -1,13 +1,12 @@
 """The built-in simulator: a four-wheeled vehicle on rigid, soft and mixed ground.
 
-A stand-in for a multibody simulator at a ten-thousandth of its cost, differentiable throughout.
-Each 0.1 s command is held over a few sub-steps of a linearly implicit integrator: springs,
-dampers, tyre friction, wheel spin and soil are stiff, and all of them act on the new velocity.
-Wheels carry spin inertia but no mass of their own: a wheel is where the ground, or the droop of
-its damper, puts it.
+A stand-in for a multibody simulator, differentiable throughout. Each 0.1 s command is held over a
+few sub-steps of a linearly implicit integrator: springs, dampers, tyre friction, wheel spin and
+soil are stiff, and all of them act on the new velocity. Wheels carry spin inertia but no mass of
+their own: a wheel is where the ground, or the droop of its damper, puts it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -17,38 +16,59 @@ from flax import struct
 
 from vertiwm_jax import geometry
 from vertiwm_jax.mechanics.newton_euler import ContactForce, Twist, advance_twist, velocity_at
+from vertiwm_jax.mechanics.touch import Touch, touch
 from vertiwm_jax.mechanics.vector import Axes, Vector
 from vertiwm_jax.mechanics.vehicle import Vehicle
-from vertiwm_jax.mechanics.wheel import Contact, Wheel, forces, rigid_forces
+from vertiwm_jax.mechanics.wheel import Contact, Wheel, WheelForces, forces, rigid_forces
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
-from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.soil import Soil
 
 GRAVITY = 9.81
 ADHESION_SPEED = 0.1
 """Slip speed, m/s, at which friction has reached 70 % of its limit."""
 SPIN_FLOOR = 0.5
 """Wheel speed, rad/s, below which a locked brake lets a wheel creep."""
-TREAD_ANGLES = (-0.7, -0.35, 0.0, 0.35, 0.7)
-"""Where a wheel's rims are tested against the ground, rad from straight down."""
-CONTACT_SOFTNESS = 0.005
-"""Depth, m, over which neighbouring points of a tread share a contact."""
-NODES = 4
-"""Quadrature nodes on each side of the stress peak: within 1 % of the converged force."""
+QUADRATURE_NODES = 4
+"""On each side of the stress peak."""
 LEAST_SINKAGE = 1e-3
+"""Sinkage, m, below which soil counts as linear."""
 LARGEST_LOAD = 2.5
 """Largest normal force on one wheel, in vehicle weights."""
 LEAST_UPRIGHT = 0.2
 """Cosine between body and ground normal below which wheels no longer carry."""
-BELLY_STIFFNESS = 5e5
-BELLY_DAMPING = 2e4
+BELLY_SECONDS = 0.1
+"""Time in which the belly, standing on ground, would drop by its depth under the weight."""
 BELLY_FRICTION = 0.5
 
 
 @struct.dataclass
 class SimulatorParams:
+    """vehicle; contact: of wheels in soil.
+
+    stiffening: `[]` factor on Bekker's moduli of the map's soils; shear_scale: `[]` factor on
+    their shear modulus K. 1 is the soil of the equations.
+    """
+
     vehicle: Vehicle
     contact: Contact
+    stiffening: jax.Array
+    shear_scale: jax.Array
+
+
+def chrono_like(vehicle: Vehicle) -> SimulatorParams:
+    """Soil contact fitted to Chrono's SCM, on the training drives of an HMMWV.
+
+    SCM soil is far stiffer than Bekker's equation under a wheel: pushed-up soil carries too,
+    normal stress grows with penetration speed, and shear displacement is a path length that
+    never resets, so friction is mobilised early.
+    """
+    return SimulatorParams(
+        vehicle=jax.tree.map(jnp.asarray, vehicle),
+        contact=Contact(peak=0.2, peak_slip=0.0, unload_stiffness=2e7, creep_speed=ADHESION_SPEED),
+        stiffening=jnp.float32(6.0),
+        shear_scale=jnp.float32(0.144),
+    )
 
 
 @struct.dataclass
@@ -139,173 +159,184 @@ def _substep(
     vehicle = params.vehicle
     axes = Axes.from_quaternion(body.quaternion)
     centre = Vector.of(vehicle.centre_of_mass)
-
-    # Driver: proportional speed control and rate-limited steering.
     forward = body.twist.linear.x
     pedal = jnp.clip(vehicle.speed_gain * (command.speed - forward), -1.0, 1.0)
     target = jnp.clip(command.steering, -vehicle.steering_limit, vehicle.steering_limit)
     turn = vehicle.steering_rate * seconds
     steering = history.steering + jnp.clip(target - history.steering, -turn, turn)
 
-    # Ground under the treads and under the belly, in one query.
     steer = jnp.concatenate([jnp.full(2, steering), jnp.zeros(2)])
-    cos, sin = jnp.cos(steer), jnp.sin(steer)
-    hub = Vector(vehicle.wheel_position[:, 0], vehicle.wheel_position[:, 1], history.travel)
-    tread = _tread(vehicle, hub, cos, sin)
-    belly = Vector.of(vehicle.belly)
-    points = Vector(*(jnp.concatenate([t.ravel(), b]) for t, b in zip(tread, belly, strict=True)))
-    world = body.position.plus(axes.to_world(points))
-    ground = query.surface(terrain, jnp.stack([world.x, world.y], axis=-1))
-    slope_x, slope_y = ground.gradient[:, 0], ground.gradient[:, 1]
-    steepness = jax.lax.rsqrt(1 + slope_x**2 + slope_y**2)
-    normal = axes.to_body(Vector(-slope_x * steepness, -slope_y * steepness, steepness))
-    # Depth below the tangent plane: vertical depth times the normal's upward part.
-    depth = (ground.height - world.z) * steepness
-
-    treads = tread.x.size
-    on_tread = lambda a: a[:treads].reshape(tread.x.shape)
-    tread_depth = on_tread(depth)
-    share = jax.nn.softmax(tread_depth / CONTACT_SOFTNESS, axis=0)
-    centroid = lambda v: Vector(*(jnp.sum(share * c, axis=0) for c in v))
-    n = centroid(Vector(*(on_tread(c) for c in normal))).normalised()
-    arm = centroid(tread).plus(centre, -1.0)
-    friction = jnp.sum(share * on_tread(ground.friction), axis=0)
-
-    # Suspension: where the wheel touches, against where its damper lets it droop to.
-    upright = jnp.maximum(n.z, LEAST_UPRIGHT)
-    stiffness = vehicle.spring + vehicle.damper / seconds
-    droop = (
-        vehicle.spring * vehicle.free_travel
-        + vehicle.damper / seconds * history.travel
-        - vehicle.wheel_weight
-    ) / stiffness
+    wheels, belly = touch(vehicle, terrain, body.position, axes, history.travel, steer)
+    n, arm = wheels.normal, wheels.point.plus(centre, -1.0)
+    rolling, lateral = _tangents(n, jnp.cos(steer), jnp.sin(steer))
     velocity = velocity_at(body.twist, arm)
-    depth_at_droop = (
-        jnp.sum(share * tread_depth, axis=0)
-        + upright * (history.travel - droop)
-        - seconds * velocity.dot(n)
-    )
-    carrying = (n.z > LEAST_UPRIGHT) & (depth_at_droop > 0)
-    rate = jnp.where(carrying, stiffness / upright**2, 0.0)
-    hardest = LARGEST_LOAD * vehicle.mass * GRAVITY
-    # Beyond it the contact yields: no wheel is thrown out of the ground it was stepped into.
-    rate = jnp.minimum(rate, hardest / jnp.maximum(depth_at_droop, 1e-6))
-    semantic = on_tread(ground.semantic)[len(TREAD_ANGLES)]
-    soft = terrain.deformable[semantic]
-
-    # Friction on rigid ground, in the rolling and the lateral direction of each wheel.
-    along = n.x * cos + n.y * sin
-    rolling = Vector(cos - along * n.x, sin - along * n.y, -along * n.z).normalised()
-    lateral = n.cross(rolling)
     ahead, drift = velocity.dot(rolling), velocity.dot(lateral)
 
-    soil = jax.tree.map(lambda leaf: leaf[semantic], terrain.soils)
-    wheel = Wheel(vehicle.wheel_radius, vehicle.wheel_width)
+    press = _suspend(vehicle, wheels, history.travel, velocity.dot(n), seconds)
     rut = jnp.concatenate([jnp.zeros(2), history.rut])
-    in_soil = forces(
-        wheel, soil, params.contact, history.sinkage, ahead, drift, history.wheel_speed, rut, NODES
-    )
-    # One Newton step a sub-step towards the sinkage at which soil and suspension agree.
-    sunk = jnp.maximum(history.sinkage - rut, LEAST_SINKAGE)
-    yielding = (soil.n + 0.5) * in_soil.normal / sunk
-    wanted = rate * depth_at_droop - in_soil.normal + yielding * history.sinkage
-    sinkage = jnp.where(soft, jnp.maximum(wanted / (rate + yielding + 1.0), 0.0), 0.0)
-    load = rate * jnp.maximum(depth_at_droop - sinkage, 0.0)
-    rate = jnp.where(soft, rate * yielding / (rate + yielding + 1.0), rate)
+    ground, sinkage, load, rate = _support(params, wheels, press, history, ahead, drift, rut)
 
-    on_rock = rigid_forces(
-        wheel, jnp.minimum(friction, vehicle.tyre_friction), load, ahead, drift,
-        history.wheel_speed, ADHESION_SPEED,
-    )
-    ground_force = jax.tree.map(lambda a, b: jnp.where(soft, a, b), in_soil, on_rock)
-    traction, side_force, moment = (
-        ground_force.longitudinal, ground_force.lateral, ground_force.torque
-    )
-    slip = ahead - vehicle.wheel_radius * history.wheel_speed
-    # Secants: the friction that is left when slip or drift has died away is none.
-    sliding = jnp.sqrt(slip**2 + drift**2 + ADHESION_SPEED**2)
-    grip = jnp.sqrt((moment / vehicle.wheel_radius) ** 2 + side_force**2) / sliding
-
-    # Wheel spin, eliminated: the traction that is left once spin has answered.
-    mean_speed = jnp.mean(history.wheel_speed)
-    power_limited = vehicle.wheel_power / jnp.maximum(jnp.abs(mean_speed), 1.0)
-    drive = jnp.maximum(pedal, 0.0) * jnp.minimum(vehicle.wheel_torque, power_limited)
-    brake = jnp.maximum(-pedal, 0.0) * vehicle.brake_torque
-    brake = brake / (jnp.abs(history.wheel_speed) + SPIN_FLOOR)
+    # What friction loses per slip: the secant to no friction at no slip.
     radius = vehicle.wheel_radius
-    effective_inertia = vehicle.wheel_inertia + seconds * (brake + radius**2 * grip)
-    free_spin = seconds * (drive - brake * history.wheel_speed - moment) / effective_inertia
-    traction_rate = grip * (1 - seconds * radius**2 * grip / effective_inertia)
+    sliding = jnp.sqrt((ahead - radius * history.wheel_speed) ** 2 + drift**2 + ADHESION_SPEED**2)
+    grip = jnp.sqrt((ground.torque / radius) ** 2 + ground.lateral**2) / sliding
+
+    # Wheel spin is eliminated: traction is what is left of it once the spin has answered.
+    drive, brake = _drivetrain(vehicle, pedal, history.wheel_speed)
+    inertia = vehicle.wheel_inertia + seconds * (brake + radius**2 * grip)
+    spin_up = seconds * (drive - brake * history.wheel_speed - ground.torque) / inertia
+    traction = ground.longitudinal + radius * grip * spin_up
+    traction_rate = grip * (1 - seconds * radius**2 * grip / inertia)
 
     contacts = [
-        ContactForce(n, arm, load, rate * seconds),
-        ContactForce(rolling, arm, traction + radius * grip * free_spin, traction_rate),
-        ContactForce(lateral, arm, side_force, grip),
-        *_belly_contact(body.twist, belly.plus(centre, -1.0), normal, depth, treads, seconds),
+        ContactForce(n, arm, load, seconds * rate),
+        ContactForce(rolling, arm, traction, traction_rate),
+        ContactForce(lateral, arm, ground.lateral, grip),
+        *_belly_contact(vehicle, body.twist, belly, centre, seconds),
     ]
     gravity = Vector(axes.x.z, axes.y.z, axes.z.z).times(-GRAVITY)
     twist = advance_twist(
         body.twist, vehicle.mass, Vector.of(vehicle.inertia), gravity, contacts, seconds
     )
-    change = Twist(
-        twist.linear.plus(body.twist.linear, -1.0), twist.angular.plus(body.twist.angular, -1.0)
-    )
-    gained = velocity_at(change, arm)
-    wheel_speed = (
-        history.wheel_speed + free_spin + seconds * radius * grip * gained.dot(rolling) / effective_inertia
-    )
-    raised = jnp.where(carrying, (depth_at_droop - sinkage - seconds * gained.dot(n)) / upright, 0.0)
-    travel = droop + raised
 
+    gained = velocity_at(twist, arm).plus(velocity, -1.0)
+    pushed = press.depth - sinkage - seconds * gained.dot(n)
     # The rear wheels find the front ones' ruts a wheelbase later, as far as they track them.
     fresh = 1 - jnp.exp(-seconds * jnp.abs(forward) / vehicle.wheelbase)
-    rut = history.rut + fresh * (sinkage[:2] - history.rut)
-    history = SimulatorHistory(wheel_speed, travel, steering, sinkage, rut)
+    history = SimulatorHistory(
+        wheel_speed=history.wheel_speed
+        + spin_up
+        + seconds * radius * grip * gained.dot(rolling) / inertia,
+        travel=press.droop + jnp.where(press.carrying, pushed / press.upright, 0.0),
+        steering=steering,
+        sinkage=sinkage,
+        rut=history.rut + fresh * (sinkage[:2] - history.rut),
+    )
     return _advance_pose(body, axes, centre, twist, seconds), history
 
 
-def _tread(vehicle: Vehicle, hub: Vector, cos: jax.Array, sin: jax.Array) -> Vector:
-    """Points `[10, 4]` on the two rims of the lower half of each wheel, body components."""
-    angle = jnp.repeat(jnp.array(TREAD_ANGLES), 2)[:, None]
-    side = jnp.tile(jnp.array([0.5, -0.5]), len(TREAD_ANGLES))[:, None]
-    ahead = vehicle.wheel_radius * jnp.sin(angle)
-    left = vehicle.wheel_width * side
-    return Vector(
-        hub.x + ahead * cos - left * sin,
-        hub.y + ahead * sin + left * cos,
-        hub.z - vehicle.wheel_radius * jnp.cos(angle),
+class _Press(NamedTuple):
+    """How the suspension presses each wheel `[4]` onto the ground.
+
+    droop: m, the height in the body to which a free wheel would fall within the sub-step.
+    depth: m below the tangent plane at that height. upright: cosine between body and normal.
+    stiffness: N/m along the normal. carrying: bool.
+    """
+
+    droop: jax.Array
+    depth: jax.Array
+    upright: jax.Array
+    stiffness: jax.Array
+    carrying: jax.Array
+
+
+def _suspend(
+    vehicle: Vehicle, wheels: Touch, travel: jax.Array, leaving: jax.Array, seconds: float
+) -> _Press:
+    """Implicit Euler of a massless wheel between spring, damper, its weight and the ground.
+
+    leaving: `[4]` m/s, velocity along the normal.
+    """
+    upright = jnp.maximum(wheels.normal.z, LEAST_UPRIGHT)
+    damping = vehicle.damper / seconds
+    stiffness = vehicle.spring + damping
+    relaxed = vehicle.spring * vehicle.free_travel + damping * travel - vehicle.wheel_weight
+    droop = relaxed / stiffness
+    depth = wheels.depth + upright * (travel - droop) - seconds * leaving
+    carrying = (wheels.normal.z > LEAST_UPRIGHT) & (depth > 0)
+    # Beyond the largest load a contact yields: no wheel is thrown out of ground it stepped into.
+    largest = LARGEST_LOAD * vehicle.mass * GRAVITY
+    stiffness = jnp.minimum(stiffness / upright**2, largest / jnp.where(carrying, depth, 1.0))
+    return _Press(droop, depth, upright, jnp.where(carrying, stiffness, 0.0), carrying)
+
+
+def _support(
+    params: SimulatorParams,
+    wheels: Touch,
+    press: _Press,
+    history: SimulatorHistory,
+    ahead: jax.Array,
+    drift: jax.Array,
+    rut: jax.Array,
+) -> tuple[WheelForces, jax.Array, jax.Array, jax.Array]:
+    """Forces on the wheels, new sinkage m, load N and its stiffness N/m, all `[4]`.
+
+    Soil and suspension share the depth: one Newton step a sub-step towards the sinkage at which
+    their forces agree. Rigid ground leaves all of it to the suspension.
+    """
+    vehicle, soil = params.vehicle, _scaled(params, wheels.soil)
+    wheel = Wheel(vehicle.wheel_radius, vehicle.wheel_width)
+    spin = history.wheel_speed
+    in_soil = forces(
+        wheel, soil, params.contact, history.sinkage, ahead, drift, spin, rut, QUADRATURE_NODES
+    )
+    # Normal force grows about like sinkage to the power n + 1/2 (Bekker, wheel on flat ground).
+    sunk = jnp.maximum(history.sinkage - rut, LEAST_SINKAGE)
+    yielding = (soil.n + 0.5) * in_soil.normal / sunk
+    together = press.stiffness + yielding
+    together = jnp.where(together > 0, together, 1.0)
+    wanted = press.stiffness * press.depth - in_soil.normal + yielding * history.sinkage
+    sinkage = jnp.where(wheels.soft, jnp.maximum(wanted / together, 0.0), 0.0)
+    load = press.stiffness * jnp.maximum(press.depth - sinkage, 0.0)
+    rate = press.stiffness * jnp.where(wheels.soft, yielding / together, 1.0)
+
+    friction = jnp.minimum(wheels.friction, vehicle.tyre_friction)
+    on_rock = rigid_forces(wheel, friction, load, ahead, drift, spin, ADHESION_SPEED)
+    ground = jax.tree.map(lambda a, b: jnp.where(wheels.soft, a, b), in_soil, on_rock)
+    return ground, sinkage, load, rate
+
+
+def _scaled(params: SimulatorParams, soil: Soil) -> Soil:
+    return replace(
+        soil,
+        kc=params.stiffening * soil.kc,
+        kphi=params.stiffening * soil.kphi,
+        shear_modulus=params.shear_scale * soil.shear_modulus,
     )
 
 
+def _drivetrain(
+    vehicle: Vehicle, pedal: jax.Array, wheel_speed: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Driving torque on each wheel, N m, and braking torque per wheel speed, N m s/rad `[4]`.
+
+    Open differentials: all wheels get the same torque, limited by power at their mean speed.
+    """
+    mean_speed = jnp.maximum(jnp.abs(jnp.mean(wheel_speed)), 1.0)
+    torque = jnp.minimum(vehicle.wheel_torque, vehicle.wheel_power / mean_speed)
+    brake = vehicle.brake_torque / (jnp.abs(wheel_speed) + SPIN_FLOOR)
+    return jnp.maximum(pedal, 0.0) * torque, jnp.maximum(-pedal, 0.0) * brake
+
+
+def _tangents(normal: Vector, cos: jax.Array, sin: jax.Array) -> tuple[Vector, Vector]:
+    """Directions in the tangent plane along and to the left of a heading in the body."""
+    rise = normal.x * cos + normal.y * sin
+    along = Vector(cos - rise * normal.x, sin - rise * normal.y, -rise * normal.z).normalised()
+    return along, normal.cross(along)
+
+
 def _belly_contact(
-    twist: Twist, arms: Vector, normal: Vector, depth: jax.Array, first: int, seconds: float
+    vehicle: Vehicle, twist: Twist, belly: Touch, centre: Vector, seconds: float
 ) -> list[ContactForce]:
-    """The chassis on the ground: a penalty force and friction at its deepest point."""
-    deepest = jnp.argmax(depth[first:])
-    pick = lambda v: Vector(*(c[deepest][None] for c in v))
-    arm, n = pick(arms), pick(Vector(*(c[first:] for c in normal)))
-    depth = depth[first:][deepest][None]
+    """The chassis on the ground: a heavily damped spring, and friction."""
+    arm, n = belly.point.plus(centre, -1.0), belly.normal
+    forward, left = _tangents(n, jnp.ones(1), jnp.zeros(1))
     velocity = velocity_at(twist, arm)
-    sinking = -velocity.dot(n)
-    rate = BELLY_STIFFNESS * seconds + BELLY_DAMPING
-    load = BELLY_STIFFNESS * depth + rate * sinking
-    pressing = (depth > 0) & (load > 0)
-    rate, load = jnp.where(pressing, rate, 0.0), jnp.where(pressing, load, 0.0)
-    sliding = velocity.plus(n, sinking)
-    speed = jnp.sqrt(sliding.dot(sliding) + ADHESION_SPEED**2)
-    grip = BELLY_FRICTION * load / speed
-    forward = Vector(1 - n.x * n.x, -n.x * n.y, -n.x * n.z).normalised()
-    left = n.cross(forward)
+    stiffness = 2 * vehicle.mass / BELLY_SECONDS**2
+    rate = stiffness * (seconds + BELLY_SECONDS)
+    load = stiffness * belly.depth - rate * velocity.dot(n)
+    pressing = (belly.depth > 0) & (load > 0)
+    load, rate = jnp.where(pressing, load, 0.0), jnp.where(pressing, rate, 0.0)
+    ahead, drift = velocity.dot(forward), velocity.dot(left)
+    grip = BELLY_FRICTION * load * jax.lax.rsqrt(ahead**2 + drift**2 + ADHESION_SPEED**2)
     return [
         ContactForce(n, arm, load, rate),
-        ContactForce(forward, arm, -grip * sliding.dot(forward), grip),
-        ContactForce(left, arm, -grip * sliding.dot(left), grip),
+        ContactForce(forward, arm, -grip * ahead, grip),
+        ContactForce(left, arm, -grip * drift, grip),
     ]
 
 
-def _advance_pose(
-    body: _Body, axes: Axes, centre: Vector, twist: Twist, seconds: float
-) -> _Body:
+def _advance_pose(body: _Body, axes: Axes, centre: Vector, twist: Twist, seconds: float) -> _Body:
     """Moves the centre of mass by the new velocity and turns the body about it."""
     w = twist.angular.stacked()
     rotation = jaxlie.SO3(body.quaternion) @ jaxlie.SO3.exp(seconds * w)

@@ -20,6 +20,9 @@ from vertiwm_jax.terrain.soil import Soil
 
 Scalar = jax.Array | float
 
+PANELS = 5
+"""Pieces of the contact within which the stresses are smooth; see `breaks`."""
+
 _MAX_PEAK = 0.98  # of th1; the peak stays inside the contact
 
 
@@ -89,12 +92,11 @@ class Patch(NamedTuple):
 
 
 class Arc(NamedTuple):
-    """A point of the rim: its angle with sine and cosine, and its cosine above the start's."""
+    """Points of the rim: angles with their sines and cosines."""
 
     angle: jax.Array
     sin: jax.Array
     cos: jax.Array
-    rise: jax.Array
 
 
 def slip(velocity_x: Scalar, rim_speed: Scalar, creep_speed: Scalar = 0.05) -> jax.Array:
@@ -153,18 +155,64 @@ def _contact_angle(depth: jax.Array) -> jax.Array:
     return jnp.where(positive, 2 * jnp.arcsin(half), 0.0)
 
 
-def arc(start: jax.Array, offset: jax.Array) -> Arc:
-    """The point at `offset` from the angle `start`, rad; offsets up to 4.2."""
-    # Half-angle identities keep `rise` exact near the start, where stress begins. Series serve
-    # for the library's sine and cosine, which would take most of the time of a wheel's forces.
-    a = offset / 2
-    y = a * a
-    sin_a = a * _horner(y, 1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
-    cos_a = _horner(y, 1, -1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600)
-    sin_start, cos_start = jnp.sin(start), jnp.cos(start)
-    rise = -2 * sin_a * (sin_start * cos_a + cos_start * sin_a)
-    advance = 2 * sin_a * (cos_start * cos_a - sin_start * sin_a)
-    return Arc(start + offset, sin_start + advance, cos_start + rise, rise)
+def breaks(p: Patch, m: Motion) -> tuple[jax.Array, ...]:
+    """Angles from exit to entry, `PANELS + 1` of them, between which the stresses are smooth.
+
+    Beside the peak they are, under a skidding wheel, the reversal of the flow of soil and the
+    points ahead of it and behind it where the slip velocity changes sign. A driven wheel has
+    none of these: they collapse on its peak.
+    """
+    mean = _mean_cosine(p)
+    skid = m.slip < 0
+    ratio = jnp.clip(jnp.where(skid, m.rim / jnp.where(skid, m.hub, 1.0), 0.5), -0.999, 0.999)
+    still_rear = jnp.clip(jnp.arccos(ratio), p.exit, p.reversal)
+    still_front = jnp.clip(_contact_angle(1 - mean), p.reversal, p.entry)
+    low, middle, high = (jnp.where(skid, x, p.peak) for x in (still_rear, p.reversal, still_front))
+    return (
+        p.exit,
+        jnp.minimum(low, p.peak),
+        jnp.clip(p.peak, low, middle),
+        jnp.clip(p.peak, middle, high),
+        jnp.maximum(high, p.peak),
+        p.entry,
+    )
+
+
+def _mean_cosine(p: Patch) -> jax.Array:
+    """Mean cosine between reversal and entry, Wong and Reece's (1 + Kv (1 + i))/(1 + i)."""
+    # Written as a sinc it stays exact when the arc vanishes.
+    half = (p.entry - p.reversal) / 2
+    return jnp.cos((p.entry + p.reversal) / 2) * jnp.sinc(half / jnp.pi)
+
+
+def arc(p: Patch, angle: jax.Array) -> Arc:
+    """The point of the rim at `angle` rad."""
+    sin_a, cos_a = _sin_cos((p.entry - angle) / 2)
+    sin_entry, cos_entry = jnp.sin(p.entry), jnp.cos(p.entry)
+    return Arc(
+        angle,
+        sin_entry - 2 * sin_a * (cos_entry * cos_a + sin_entry * sin_a),
+        cos_entry + 2 * sin_a * (sin_entry * cos_a - cos_entry * sin_a),
+    )
+
+
+def pressing_depth(p: Patch, angle: jax.Array) -> jax.Array:
+    """Depth in radii whose pressure acts at `angle`: cos th - cos th1, mirrored behind thm."""
+    behind = p.peak - p.exit
+    some = behind > 0
+    scale = jnp.where(some, (p.entry - p.peak) / jnp.where(some, behind, 1.0), 0.0)
+    from_entry = jnp.where(angle < p.peak, (angle - p.exit) * scale, p.entry - angle)
+    # Half angles, because the difference of two cosines is lost in rounding near the entry.
+    sin_a, cos_a = _sin_cos(from_entry / 2)
+    return 2 * sin_a * (jnp.sin(p.entry) * cos_a - jnp.cos(p.entry) * sin_a)
+
+
+def _sin_cos(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Sine and cosine for |x| < 2.1, to float32: the library's would take most of the time."""
+    y = x * x
+    sin = x * _horner(y, 1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
+    cos = _horner(y, 1, -1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600)
+    return sin, cos
 
 
 def _horner(x: jax.Array, *coefficients: float) -> jax.Array:
@@ -195,10 +243,7 @@ def shear_stress(
     soil: Soil, contact: Contact, p: Patch, m: Motion, at: Arc, sigma: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Janosi-Hanamoto shear in Pa on the wheel: along the rim, forwards, and to the left."""
-    # Ahead of th0 the soil is pushed forward with the mean cosine of that arc (Wong and Reece's
-    # 1 + Kv (1 + i)); written as a sinc it stays exact when the arc vanishes.
-    half = (p.entry - p.reversal) / 2
-    mean = jnp.cos((p.entry + p.reversal) / 2) * jnp.sinc(half / jnp.pi)
+    mean = _mean_cosine(p)  # ahead of th0 the soil is pushed along with it
     pushed = at.angle > p.reversal
     # Displacements times the spin: finite when the wheel locks.
     path_x = jnp.where(
@@ -224,9 +269,7 @@ def bulldozing(
     soil: Soil, contact: Contact, radius: Scalar, p: Patch, m: Motion, at: Arc
 ) -> jax.Array:
     """Side force per angle and wheel radius, N/(rad m), of the soil the wheel's flank pushes."""
-    sin_slip_angle = -m.lateral * jax.lax.rsqrt(
-        m.hub**2 + m.lateral**2 + contact.creep_speed**2
-    )
+    sin_slip_angle = -m.lateral * jax.lax.rsqrt(m.hub**2 + m.lateral**2 + contact.creep_speed**2)
     tangent = jnp.tan(soil.friction_angle)
     cotangent = jnp.tan(jnp.pi / 4 + soil.friction_angle / 2)  # of Xc; equals tan(Xc + phi)
     if contact.bulldozing == "ishigami":
@@ -237,7 +280,7 @@ def bulldozing(
     # Wong: the pressed soil fills the segment under the chord from exit to entry.
     share = (at.sin - jnp.sin(p.exit)) / (jnp.sin(p.entry) - jnp.sin(p.exit))
     chord = share * (jnp.cos(p.exit) - jnp.cos(p.entry))
-    height = radius * jnp.clip(chord - jnp.cos(p.exit) + at.cos, 0.0, 2 * at.cos)
+    height = radius * jnp.clip(chord - jnp.cos(p.exit) + at.cos, 0.0, 2 * jnp.abs(at.cos))
     pressure = soil.unit_weight / 2 * (height * cotangent) ** 2 * (1 + cotangent * tangent / 2)
     pressure = pressure + 2 * height * soil.cohesion * cotangent
     return pressure * at.cos * sin_slip_angle * jnp.abs(sin_slip_angle)

@@ -62,14 +62,15 @@ def forces(
     velocity_y: Scalar,
     omega: Scalar,
     rut: Scalar = 0.0,
-    nodes: int = 8,
+    nodes: int = 6,
 ) -> WheelForces:
     """Forces on a wheel at a given sinkage, all `[...]`, continuous through every regime.
 
     sinkage: m below the undisturbed surface; at or above the floor of the rut there is no force.
     velocity_x, velocity_y: m/s of the hub, ahead and to the left. omega: rad/s, positive ahead.
     rut: m, the deepest sinkage that earlier passes left; see `deepen`.
-    nodes: Gauss-Legendre nodes, for each side of the stress peak.
+    nodes: Gauss-Legendre nodes in each of five pieces of the contact; 6 are within 0.1 % (99 % of
+        random wheels, soils and motions).
 
     Driven, braked, towed, reversing and standing wheels are one formula; values and gradients
     are finite for any finite state. Only a wheel that spins against its travel as fast as it
@@ -84,22 +85,24 @@ def forces(
     n = soil.n + contact.slip_sinkage * jnp.maximum(m.slip, 0.0)
     n = n + contact.skid_sinkage * jnp.maximum(-m.slip, 0.0)
     keq = soil.kc / wheel.width + soil.kphi
-    unload = contact.unload_stiffness + contact.unload_slope * rut
+    # Soil that was never loaded yields at once: no elastic branch.
+    unload = jnp.where(rut > 0, contact.unload_stiffness + contact.unload_slope * rut, 1e15)
     floor = stress.rut_floor(keq, n, unload, rut)
 
     depth = jnp.clip((sinkage - floor) / wheel.radius, 0.0, MAX_SINKAGE)
     touching = depth > _MIN_SINKAGE
     depth = jnp.where(touching, depth, _MIN_SINKAGE)
     patch = stress.patch(contact, soil.friction_angle, depth, m)
-    ahead, behind = patch.entry - patch.peak, patch.peak - patch.exit
+    starts = jnp.stack(stress.breaks(patch, m))
+    extents = jnp.diff(starts, axis=0)
 
     def add_node(total: jax.Array, node: jax.Array) -> tuple[tuple[jax.Array, ...], None]:
-        point, weight = node
-        front = stress.arc(patch.entry, -point * ahead)
-        rear = stress.arc(patch.exit, point * behind)
-        # Stress behind the peak mirrors stress ahead of it: both sides share one power.
-        sigma = stress.normal_stress(keq, n, unload, floor, wheel.radius * front.rise)
-        for at, extent in ((front, ahead), (rear, behind)):
+        points, weights = node
+        for panel in range(stress.PANELS):
+            at = stress.arc(patch, starts[panel] + points[panel] * extents[panel])
+            weight = weights[panel] * extents[panel]
+            z = wheel.radius * stress.pressing_depth(patch, at.angle)
+            sigma = stress.normal_stress(keq, n, unload, floor, z)
             tau_x, tau_y = stress.shear_stress(soil, contact, patch, m, at, sigma)
             side = stress.bulldozing(soil, contact, wheel.radius, patch, m, at)
             integrands = (
@@ -108,12 +111,10 @@ def forces(
                 sigma * at.cos + m.rolling * tau_x * at.sin,
                 tau_x,
             )
-            total = tuple(
-                t + weight * extent * y for t, y in zip(total, integrands, strict=True)
-            )
+            total = tuple(t + weight * y for t, y in zip(total, integrands, strict=True))
         return total, None
 
-    # A loop over nodes, each a pass over all wheels, is six times faster than an axis of nodes:
+    # A loop over nodes, each a pass over all wheels, is many times faster than an axis of nodes:
     # nothing of a node goes through memory.
     total, _ = jax.lax.scan(add_node, (jnp.zeros(shape),) * 4, _quadrature(nodes))
     longitudinal, lateral, normal, torque = (jnp.where(touching, t, 0.0) for t in total)
@@ -127,14 +128,18 @@ def forces(
 
 
 def _quadrature(nodes: int) -> tuple[jax.Array, jax.Array]:
-    """Gauss-Legendre points and weights on [0, 1], `[nodes]`, crowded towards 0.
+    """Gauss-Legendre points and weights on [0, 1] for every panel, `[nodes, panels]`.
 
-    The points are squared: stress grows like a power n of the distance from the edge of the
-    contact and shear like an exponential, and both need their points there.
+    Crowded by a square towards the exit in the first panel and the entry in the last, where
+    stress grows like a power and shear like an exponential of the distance, by a cubic towards
+    both ends of those between, where shear reverses.
     """
     x, w = np.polynomial.legendre.leggauss(nodes)
-    x = (x + 1) / 2
-    return jnp.asarray(x**2, jnp.float32), jnp.asarray(w * x, jnp.float32)
+    x, w = (x + 1) / 2, w / 2
+    middle = (x**2 * (3 - 2 * x), 6 * x * (1 - x) * w)
+    panels = [(x**2, 2 * x * w), *[middle] * (stress.PANELS - 2), (1 - x**2, 2 * x * w)]
+    points, weights = (jnp.asarray(np.stack(y, -1), jnp.float32) for y in zip(*panels))
+    return points, weights
 
 
 def rigid_forces(

@@ -76,14 +76,14 @@ def train(
     like = jax.eval_shape(init, env_params, keys)
     checkpoint = checkpoints.latest(folder)
     done = int(checkpoint.name) if checkpoint else 0
-    if checkpoint and done >= iterations:
-        return checkpoints.load(checkpoint, like)
+    state = checkpoints.load(checkpoint, like) if checkpoint else init(env_params, keys)
+    if done >= iterations:
+        return state
 
     print("compiling ...", flush=True)
     start = time.perf_counter()
     iterate = jax.jit(jax.vmap(algorithm.iterate, (None, 0)), donate_argnums=1)
-    iterate = iterate.lower(env_params, like).compile()
-    state = checkpoints.load(checkpoint, like) if checkpoint else init(env_params, keys)
+    iterate = iterate.lower(env_params, state).compile()
     print(f"compiled in {time.perf_counter() - start:.0f} s", flush=True)
 
     total = (iterations - done) * transitions * config.seeds

@@ -73,7 +73,19 @@ def stack(soils: Sequence[Soil]) -> Soil:
     """S soils with leaves `[...]` to one with leaves `[S, ...]`, float32."""
     if not soils:
         raise ValueError("stack: expected at least one soil, found none")
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.float32(x) for x in leaves]), *soils)
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, jnp.float32) for x in leaves]), *soils)
+
+
+def reece_moduli(
+    k1: jax.Array | float, k2: jax.Array | float, n: jax.Array | float, width: jax.Array | float
+) -> tuple[jax.Array | float, jax.Array | float]:
+    """Bekker's kc and kphi that press like Reece's (k1 + k2 width)(z / width)^n, all `[...]`.
+
+    k1: Pa. k2: Pa/m. width: m, the smaller side of the contact; the moduli hold for it alone.
+    Source: Reece (1965); Wong and Reece, J. Terramechanics 4(1) (1967).
+    """
+    scale = width ** (1 - n)
+    return k1 * scale, k2 * scale
 
 
 # What each parameter may be, and the mistake that a value outside usually is.

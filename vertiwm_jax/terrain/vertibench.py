@@ -31,8 +31,9 @@ def load(folder: str | Path, numbers: Iterable[int] | None = None) -> TerrainMap
     if numbers is None:
         found = (re.fullmatch(r"(\d+)\.bmp", f.name) for f in (maps / "Worlds").iterdir())
         numbers = sorted(int(match[1]) for match in found if match)
-    configs = [_config_path(maps, number) for number in numbers]
-    return stack([_world(maps, config) for config in configs], [str(path) for path in configs])
+    configs = {number: _config_path(maps, number) for number in numbers}
+    worlds = [_world(maps / "Worlds" / f"{number}.bmp", path) for number, path in configs.items()]
+    return stack(worlds, [str(path) for path in configs.values()])
 
 
 def _config_path(maps: Path, number: int) -> Path:
@@ -45,8 +46,7 @@ def _config_path(maps: Path, number: int) -> Path:
     return found[0]
 
 
-def _world(maps: Path, path: Path) -> TerrainMap:
-    number = re.match(r"config(\d+)_", path.name)[1]  # type: ignore[index]
+def _world(image: Path, path: Path) -> TerrainMap:
     name = str(path)
     # The C loader is ten times as fast, where PyYAML was built with it.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -57,10 +57,14 @@ def _world(maps: Path, path: Path) -> TerrainMap:
         obstacles = _obstacles(config["obstacles"])
     except yaml.YAMLError as error:
         raise MapError(name, "file", "YAML", " ".join(str(error).split())) from None
-    except (KeyError, TypeError) as error:
+    except KeyError as error:
         raise MapError(name, "file", "Verti-Bench's fields", f"no {error}") from None
+    except MapError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise MapError(name, "file", "Verti-Bench's fields", f"one ill-typed: {error}") from None
     return build(
-        _gray(maps / "Worlds" / f"{number}.bmp") * (max_height / 255),
+        _gray(image) * (max_height / 255),
         semantic,
         friction,
         obstacles,

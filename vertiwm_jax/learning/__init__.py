@@ -1,0 +1,1 @@
+"""Recorded drives: reading them, cutting them into windows, fitting models to them."""
