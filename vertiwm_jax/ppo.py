@@ -17,7 +17,7 @@ from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation import plots, report
 from vertiwm_jax.evaluation.controllers import RandomActions, StraightToGoal
 from vertiwm_jax.evaluation.navigation import NavigationResult, evaluate
-from vertiwm_jax.mechanics.simulator import Simulator, SimulatorParams
+from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.rl import checkpoints, ground
 from vertiwm_jax.rl.checkpoints import CheckpointError
@@ -102,7 +102,7 @@ def environment(config: TrainConfig) -> tuple[NavigationEnv, NavigationParams, N
     """The environment, its parameters to train with, and those to test with."""
     world_key, task_key = jax.random.split(jax.random.key(config.seed))
     env = NavigationEnv(config.simulator, config.navigation)
-    params = SimulatorParams(hmmwv())
+    params = chrono_like(hmmwv())
     terrain, held_out = ground.grounds(config.ground, config.worlds, world_key)
     chassis = config.navigation.chassis
     tasks = ground.training_tasks(config.ground, terrain, chassis, task_key)

@@ -24,7 +24,7 @@ def equilibrium_sinkage(
 
     The floor of the rut (zero on undisturbed soil) without load; `MAX_SINKAGE` radii below the
     bottom of the rut where the soil cannot carry it. Differentiable in both modes by the
-    implicit-function theorem; the gradient is zero at both ends.
+    implicit-function theorem; the gradient is zero without load.
     """
 
     def unbalanced(sinkage: jax.Array) -> jax.Array:

@@ -48,12 +48,15 @@ class SimulatorParams:
 
     stiffening: `[]` factor on Bekker's moduli of the map's soils; shear_scale: `[]` factor on
     their shear modulus K. 1 is the soil of the equations.
+    upright_stress: `[]` share of the soil's normal stress that acts along the ground's normal
+    instead of the rim's: it then resists the wheel's spin and not its motion. 0 is Wong's wheel.
     """
 
     vehicle: Vehicle
     contact: Contact
     stiffening: jax.Array
     shear_scale: jax.Array
+    upright_stress: jax.Array
 
 
 def chrono_like(vehicle: Vehicle) -> SimulatorParams:
@@ -65,9 +68,12 @@ def chrono_like(vehicle: Vehicle) -> SimulatorParams:
     """
     return SimulatorParams(
         vehicle=jax.tree.map(jnp.asarray, vehicle),
-        contact=Contact(peak=0.2, peak_slip=0.0, unload_stiffness=2e7, creep_speed=ADHESION_SPEED),
-        stiffening=jnp.float32(6.0),
-        shear_scale=jnp.float32(0.144),
+        contact=Contact(
+            peak=0.3, peak_slip=0.05, exit=-0.13, unload_stiffness=7e6, creep_speed=ADHESION_SPEED
+        ),
+        stiffening=jnp.float32(12.0),
+        shear_scale=jnp.float32(0.85),
+        upright_stress=jnp.float32(0.8),
     )
 
 
@@ -270,6 +276,13 @@ def _support(
     in_soil = forces(
         wheel, soil, params.contact, history.sinkage, ahead, drift, spin, rut, QUADRATURE_NODES
     )
+    # Compaction resistance is what shear gives the axle and the hub does not get.
+    moved = params.upright_stress * (in_soil.torque / wheel.radius - in_soil.longitudinal)
+    in_soil = replace(
+        in_soil,
+        longitudinal=in_soil.longitudinal + moved,
+        torque=in_soil.torque + wheel.radius * moved,
+    )
     # Normal force grows about like sinkage to the power n + 1/2 (Bekker, wheel on flat ground).
     sunk = jnp.maximum(history.sinkage - rut, LEAST_SINKAGE)
     yielding = (soil.n + 0.5) * in_soil.normal / sunk
@@ -318,14 +331,14 @@ def _tangents(normal: Vector, cos: jax.Array, sin: jax.Array) -> tuple[Vector, V
 def _belly_contact(
     vehicle: Vehicle, twist: Twist, belly: Touch, centre: Vector, seconds: float
 ) -> list[ContactForce]:
-    """The chassis on the ground: a heavily damped spring, and friction."""
+    """The chassis on rigid ground: a heavily damped spring, and friction. Soil gives way."""
     arm, n = belly.point.plus(centre, -1.0), belly.normal
     forward, left = _tangents(n, jnp.ones(1), jnp.zeros(1))
     velocity = velocity_at(twist, arm)
     stiffness = 2 * vehicle.mass / BELLY_SECONDS**2
     rate = stiffness * (seconds + BELLY_SECONDS)
     load = stiffness * belly.depth - rate * velocity.dot(n)
-    pressing = (belly.depth > 0) & (load > 0)
+    pressing = (belly.depth > 0) & (load > 0) & ~belly.soft
     load, rate = jnp.where(pressing, load, 0.0), jnp.where(pressing, rate, 0.0)
     ahead, drift = velocity.dot(forward), velocity.dot(left)
     grip = BELLY_FRICTION * load * jax.lax.rsqrt(ahead**2 + drift**2 + ADHESION_SPEED**2)

@@ -111,7 +111,7 @@ def slip(velocity_x: Scalar, rim_speed: Scalar, creep_speed: Scalar = 0.05) -> j
 
 
 def motion(
-    wheel: Wheel, creep_speed: Scalar, velocity_x: Scalar, velocity_y: jax.Array, omega: Scalar
+    wheel: Wheel, creep_speed: Scalar, velocity_x: Scalar, velocity_y: Scalar, omega: Scalar
 ) -> Motion:
     """The motion of a wheel `[...]`, from hub velocities in m/s and spin in rad/s."""
     rim = wheel.radius * omega
@@ -121,7 +121,7 @@ def motion(
         ahead=ahead,
         hub=ahead * velocity_x,
         rim=ahead * rim,
-        lateral=velocity_y,
+        lateral=jnp.asarray(velocity_y),
         spin=jnp.sqrt(jnp.square(omega) + (creep_speed / wheel.radius) ** 2),
         rolling=jnp.abs(both) * jax.lax.rsqrt(both**2 + creep_speed**2),
         slip=slip(velocity_x, rim, creep_speed),
@@ -222,12 +222,19 @@ def _horner(x: jax.Array, *coefficients: float) -> jax.Array:
     return value
 
 
-def rut_floor(keq: Scalar, n: Scalar, unload: Scalar, rut: jax.Array) -> jax.Array:
-    """Depth in m of the floor of a rut `rut` m deep when loaded, after its elastic rebound."""
+def reloading(contact: Contact, keq: Scalar, n: Scalar, rut: Scalar) -> tuple[jax.Array, jax.Array]:
+    """Depth in m of the floor of a rut after its elastic rebound, and its stiffness in Pa/m.
+
+    rut: m deep while loaded; soil at 0 was never loaded and yields at once.
+    """
     compacted = rut > 0
     deepest = jnp.where(compacted, rut, 1.0)
-    rebound = jnp.minimum(keq * jnp.exp(n * jnp.log(deepest)) / unload, deepest)
-    return jnp.where(compacted, deepest - rebound, 0.0)
+    pressure = keq * jnp.exp(n * jnp.log(deepest))
+    # Rebound never lifts the floor above the undisturbed surface.
+    stiffness = contact.unload_stiffness + contact.unload_slope * deepest
+    stiffness = jnp.maximum(stiffness, pressure / deepest)
+    floor = jnp.where(compacted, deepest - pressure / stiffness, 0.0)
+    return floor, jnp.where(compacted, stiffness, 1e15)
 
 
 def normal_stress(

@@ -4,6 +4,8 @@ Written for arrays of wheels: parameters and states broadcast against each other
 any leading axes `[...]`. See `stress` for the equations and their sources.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,6 +35,8 @@ LOOSE_SAND = Contact(peak=0.18, peak_slip=0.32)
 
 MAX_SINKAGE = 1.5
 """Sinkage in wheel radii beyond which forces no longer grow: the equations end there."""
+
+Arrays = tuple[jax.Array, ...]
 
 _MIN_SINKAGE = 1e-6  # in wheel radii; below it the wheel is airborne
 
@@ -85,9 +89,7 @@ def forces(
     n = soil.n + contact.slip_sinkage * jnp.maximum(m.slip, 0.0)
     n = n + contact.skid_sinkage * jnp.maximum(-m.slip, 0.0)
     keq = soil.kc / wheel.width + soil.kphi
-    # Soil that was never loaded yields at once: no elastic branch.
-    unload = jnp.where(rut > 0, contact.unload_stiffness + contact.unload_slope * rut, 1e15)
-    floor = stress.rut_floor(keq, n, unload, rut)
+    floor, unload = stress.reloading(contact, keq, n, rut)
 
     depth = jnp.clip((sinkage - floor) / wheel.radius, 0.0, MAX_SINKAGE)
     touching = depth > _MIN_SINKAGE
@@ -96,26 +98,26 @@ def forces(
     starts = jnp.stack(stress.breaks(patch, m))
     extents = jnp.diff(starts, axis=0)
 
-    def add_node(total: jax.Array, node: jax.Array) -> tuple[tuple[jax.Array, ...], None]:
-        points, weights = node
-        for panel in range(stress.PANELS):
-            at = stress.arc(patch, starts[panel] + points[panel] * extents[panel])
-            weight = weights[panel] * extents[panel]
-            z = wheel.radius * stress.pressing_depth(patch, at.angle)
-            sigma = stress.normal_stress(keq, n, unload, floor, z)
-            tau_x, tau_y = stress.shear_stress(soil, contact, patch, m, at, sigma)
-            side = stress.bulldozing(soil, contact, wheel.radius, patch, m, at)
-            integrands = (
-                tau_x * at.cos - m.rolling * sigma * at.sin,
-                wheel.width * tau_y + side,
-                sigma * at.cos + m.rolling * tau_x * at.sin,
-                tau_x,
-            )
-            total = tuple(t + weight * y for t, y in zip(total, integrands, strict=True))
-        return total, None
+    @partial(jax.checkpoint, prevent_cse=False)
+    def add_node(total: Arrays, node: Arrays) -> tuple[Arrays, None]:
+        panel, point, weight = node
+        extent = extents[panel]
+        at = stress.arc(patch, starts[panel] + point * extent)
+        z = wheel.radius * stress.pressing_depth(patch, at.angle)
+        sigma = stress.normal_stress(keq, n, unload, floor, z)
+        tau_x, tau_y = stress.shear_stress(soil, contact, patch, m, at, sigma)
+        side = stress.bulldozing(soil, contact, wheel.radius, patch, m, at)
+        integrands = (
+            tau_x * at.cos - m.rolling * sigma * at.sin,
+            wheel.width * tau_y + side,
+            sigma * at.cos + m.rolling * tau_x * at.sin,
+            tau_x,
+        )
+        weight = weight * extent
+        return tuple(t + weight * y for t, y in zip(total, integrands, strict=True)), None
 
     # A loop over nodes, each a pass over all wheels, is many times faster than an axis of nodes:
-    # nothing of a node goes through memory.
+    # nothing of a node goes through memory, nor, with the checkpoint, in the backward pass.
     total, _ = jax.lax.scan(add_node, (jnp.zeros(shape),) * 4, _quadrature(nodes))
     longitudinal, lateral, normal, torque = (jnp.where(touching, t, 0.0) for t in total)
     area = wheel.radius * wheel.width
@@ -127,8 +129,8 @@ def forces(
     )
 
 
-def _quadrature(nodes: int) -> tuple[jax.Array, jax.Array]:
-    """Gauss-Legendre points and weights on [0, 1] for every panel, `[nodes, panels]`.
+def _quadrature(nodes: int) -> Arrays:
+    """Panel, Gauss-Legendre point and weight on [0, 1] of every node, `[panels * nodes]`.
 
     Crowded by a square towards the exit in the first panel and the entry in the last, where
     stress grows like a power and shear like an exponential of the distance, by a cubic towards
@@ -138,8 +140,9 @@ def _quadrature(nodes: int) -> tuple[jax.Array, jax.Array]:
     x, w = (x + 1) / 2, w / 2
     middle = (x**2 * (3 - 2 * x), 6 * x * (1 - x) * w)
     panels = [(x**2, 2 * x * w), *[middle] * (stress.PANELS - 2), (1 - x**2, 2 * x * w)]
-    points, weights = (jnp.asarray(np.stack(y, -1), jnp.float32) for y in zip(*panels))
-    return points, weights
+    points, weights = np.concatenate(panels, axis=1, dtype=np.float32)
+    panel = jnp.repeat(jnp.arange(stress.PANELS), nodes)
+    return panel, jnp.asarray(points), jnp.asarray(weights)
 
 
 def rigid_forces(

@@ -30,13 +30,13 @@ Metrics = dict[str, jax.Array]
 class PPOConfig:
     """Settings of PPO; the defaults suit the navigation task on the built-in simulator."""
 
-    transitions: int = 2_000_000
+    transitions: int = 4_000_000
     """Environment steps of the whole training, rounded up to whole iterations."""
     num_envs: int = 256
     """Environments run side by side."""
     num_steps: int = 64
     """Steps of each environment in an iteration."""
-    epochs: int = 4
+    epochs: int = 6
     """Passes over the data of an iteration."""
     minibatches: int = 8
     """Gradient steps in a pass; divides num_envs * num_steps."""
@@ -48,7 +48,7 @@ class PPOConfig:
     """Largest change of the probability ratio that is rewarded."""
     value_clip: float | None = None
     """Largest change of a value in an iteration; none by default."""
-    learning_rate: float = 5e-4
+    learning_rate: float = 1e-3
     """Of Adam, at the start."""
     schedule: Literal["constant", "linear", "cosine"] = "linear"
     """How the learning rate goes, to 0 at the end unless constant."""

@@ -1,0 +1,42 @@
+"""Wheel-force evaluations a second: floor 2 million on two cores."""
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks._harness import measure, parser, report
+from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
+from vertiwm_jax.mechanics.wheel import Contact, Wheel, forces
+from vertiwm_jax.terrain.soil import PRESETS, stack
+
+
+def main() -> None:
+    arguments = parser(__doc__)
+    arguments.add_argument("--wheels", type=int, default=65_536, help="wheels in a batch")
+    options = arguments.parse_args()
+
+    uniform = jax.random.uniform(jax.random.key(0), (5, options.wheels))
+    soils = stack([PRESETS[name] for name in ("mud", "sand", "snow")])
+    soil = jax.tree.map(lambda x: x[(uniform[0] * 3).astype(int)], soils)
+    wheel, contact = Wheel(jnp.float32(0.467), jnp.float32(0.254)), Contact()
+    sinkage, velocity_x = 0.1 * uniform[1], 5 * uniform[2]
+    state = (sinkage, velocity_x, uniform[3] - 0.5, 12 * uniform[4])
+    load = 6000 * jnp.ones_like(sinkage)
+
+    def total(wheel, soil, contact, *state):
+        return sum(jnp.sum(x) for x in jax.tree.leaves(forces(wheel, soil, contact, *state)))
+
+    cases = {
+        "forces": (forces, state),
+        "forces and gradient": (jax.value_and_grad(total, argnums=(1, 3, 4, 5, 6)), state),
+        "equilibrium sinkage": (equilibrium_sinkage, (load, *state[1:])),
+    }
+    results = {}
+    for name, (function, inputs) in cases.items():
+        figures = measure(jax.jit(function), wheel, soil, contact, *inputs)
+        rate = options.wheels / figures["median_s"]
+        results[name] = {"wheels": options.wheels, "wheels_per_s": rate, **figures}
+    report("wheel_forces", results, options.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,253 @@
+"""The wheel against adaptive quadrature, finite differences and what must hold everywhere."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
+from vertiwm_jax.mechanics.wheel import Contact, Wheel, deepen, forces, rigid_forces, slip
+from vertiwm_jax.terrain.soil import PRESETS, stack
+
+WHEEL = Wheel(0.467, 0.254)
+SOILS = stack([PRESETS[name] for name in ("sand", "heavy_clay_25", "snow_us")])
+run = jax.jit(forces, static_argnames="nodes")
+
+
+def reference(soil, contact, sinkage, vx, vy, omega):
+    """Fx, Fy, Fz, T of a wheel that moves forwards, in float64, by scipy's adaptive quadrature."""
+    r, b = WHEEL.radius, WHEEL.width
+    kc, kphi, n, c, phi, modulus, weight = (float(x) for x in jax.tree.leaves(soil))
+    v, w = vx, r * omega
+    s = 1 - v / w if w > v else w / v - 1
+    n += contact.slip_sinkage * s if s > 0 else -contact.skid_sinkage * s
+    th1 = np.arccos(1 - sinkage / r)
+    thm = (contact.peak + contact.peak_slip * max(s, 0)) * th1
+    th2 = (contact.exit + contact.exit_slip * max(s, 0)) * th1
+    th2 -= np.arccos(1 - contact.rebound * sinkage / r)
+    th0 = th1 * (1 + min(s, 0) / 2)
+    chi = np.pi / 4 - phi / 2
+
+    def stresses(th):
+        mirrored = th if th >= thm else th1 - (th - th2) / (thm - th2) * (th1 - thm)
+        z = r * max(np.cos(mirrored) - np.cos(th1), 0)
+        sigma = (kc / b + kphi) * z**n
+        if th > th0:
+            mean = (np.sin(th1) - np.sin(th0)) / (th1 - th0)
+            jx = v / omega * (mean * (th1 - th) - (np.sin(th1) - np.sin(th)))
+            along = v * (mean - np.cos(th))
+        else:
+            jx = (w * (th0 - th) - v * (np.sin(th0) - np.sin(th))) / omega
+            along = w - v * np.cos(th)
+        jy = vy / omega * (th1 - th)
+        tau = (c + sigma * np.tan(phi)) * (1 - np.exp(-np.hypot(jx, jy) / modulus))
+        tau /= max(np.hypot(along, vy), 1e-12)
+        return sigma, tau * along, -tau * vy
+
+    def side(th):
+        h = r * (np.cos(th) - np.cos(th1)) if abs(th) < th1 else 0.0
+        d1 = 1 / np.tan(chi) + np.tan(chi + phi)
+        d2 = 1 / np.tan(chi) + np.tan(phi) / np.tan(chi) ** 2
+        pressure = d1 * (c * h + d2 * weight * h**2 / 2)
+        return -pressure * (r - h * np.cos(th)) * vy / np.hypot(vx, vy)
+
+    def integrate(f):
+        mean = (np.sin(th1) - np.sin(th0)) / (th1 - th0) if th0 < th1 else np.cos(th1)
+        turns = [thm, th0, np.arccos(mean), np.arccos(min(w / v, 1))]
+        turns = sorted({float(np.clip(x, th2, th1)) for x in (th2, th1, *turns)})
+        pieces = itertools.pairwise(turns)
+        return sum(quad(f, *x, epsabs=0, epsrel=1e-7, limit=200)[0] for x in pieces)
+
+    def fx(th):
+        sigma, tau, _ = stresses(th)
+        return r * b * (tau * np.cos(th) - sigma * np.sin(th))
+
+    def fz(th):
+        sigma, tau, _ = stresses(th)
+        return r * b * (sigma * np.cos(th) + tau * np.sin(th))
+
+    return np.array(
+        [
+            integrate(fx),
+            integrate(lambda th: r * b * stresses(th)[2] + side(th)),
+            integrate(fz),
+            integrate(lambda th: r**2 * b * stresses(th)[1]),
+        ]
+    )
+
+
+def test_agrees_with_adaptive_quadrature():
+    contact = Contact(
+        peak=0.3,
+        peak_slip=0.3,
+        exit=-0.1,
+        exit_slip=-0.1,
+        rebound=0.2,
+        slip_sinkage=0.2,
+        skid_sinkage=0.1,
+        creep_speed=1e-4,
+    )
+    cases = [  # soil, sinkage m, vx, vy m/s, omega rad/s
+        (0, 0.02, 8.0, 0.0, 10 / 0.467),
+        (0, 0.05, 10.0, 3.0, 6 / 0.467),
+        (1, 0.01, 5.0, -2.0, 10 / 0.467),
+        (1, 0.10, 9.0, 0.5, 9.2 / 0.467),
+        (2, 0.25, 10.0, -4.0, 10 / 0.467),
+        (2, 0.30, 10.0, 1.0, 3 / 0.467),
+    ]
+    index, *state = (np.array(column) for column in zip(*cases, strict=True))
+    soil = jax.tree.map(lambda x: x[index], SOILS)
+    f = run(WHEEL, soil, contact, *state, nodes=16)
+    got = np.stack([f.longitudinal, f.lateral, f.normal, f.torque], -1)
+    coarse = run(WHEEL, soil, contact, *state)
+    for i, case in enumerate(cases):
+        want = reference(jax.tree.map(lambda x, i=i: x[i], soil), contact, *case[1:])
+        np.testing.assert_allclose(got[i], want, rtol=1e-4, atol=1e-4 * want[2], err_msg=str(case))
+        np.testing.assert_allclose(coarse.longitudinal[i], want[0], atol=1e-3 * want[2])
+        np.testing.assert_allclose(coarse.normal[i], want[2], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "contact",
+    [
+        Contact(rebound=0.9, slip_sinkage=0.2, skid_sinkage=0.3),
+        Contact(reversal="rankine", bulldozing="wong"),
+    ],
+)
+def test_values_and_gradients_are_finite_in_every_corner(contact):
+    corners = itertools.product(
+        range(3),
+        [-0.1, 0.0, 1e-7, 1e-3, 0.2, 0.467, 0.9],
+        [-5.0, 0.0, 1e-6, 1.0],
+        [-3.0, 0.0, 1e-4],
+        [-40.0, 0.0, 1e-6, 1 / 0.467],
+        [0.0, 0.1],
+    )
+    grid = np.array(list(corners), np.float32)
+    soil = jax.tree.map(lambda x: x[grid[:, 0].astype(int)], SOILS)
+
+    def total(wheel, soil, contact, *state):
+        f = forces(wheel, soil, contact, *state)
+        return sum(jnp.sum(x) for x in jax.tree.leaves(f)), f
+
+    as_float = jax.tree.map(jnp.float32, (WHEEL, contact))
+    arguments = (as_float[0], soil, as_float[1], *grid[:, 1:].T)
+    derive = jax.value_and_grad(total, argnums=tuple(range(8)), has_aux=True)
+    (_, f), gradient = jax.jit(derive)(*arguments)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((f, gradient)))
+
+    airborne = grid[:, 1] <= 0
+    assert all(not np.any(x[airborne]) for x in jax.tree.leaves(f))
+    assert all(not np.any(x[airborne]) for x in gradient[3:])
+
+
+def test_gradients_agree_with_differences():
+    soil = jax.tree.map(lambda x: x[0], SOILS)
+    state = np.array([[0.03, 4.0, 0.5, 10.0], [0.03, 4.0, -0.5, 7.0], [0.05, 2.0, 0.3, 8.0]])
+    step = np.array([1e-3, 2e-2, 2e-2, 5e-2])
+
+    def outputs(x):
+        f = forces(WHEEL, soil, Contact(), *x, nodes=24)
+        return jnp.stack([f.longitudinal, f.lateral, f.normal, f.torque])
+
+    f = jax.jit(jax.vmap(outputs))
+    forward = jax.jit(jax.vmap(jax.jacfwd(outputs)))(jnp.float32(state))
+    reverse = jax.jit(jax.vmap(jax.jacrev(outputs)))(jnp.float32(state))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-3, atol=1.0)
+    for i, d in enumerate(np.diag(step)):
+        difference = (f(jnp.float32(state + d)) - f(jnp.float32(state - d))) / (2 * step[i])
+        scale = np.abs(difference).max()
+        np.testing.assert_allclose(forward[..., i], difference, rtol=0.03, atol=0.01 * scale)
+
+
+def test_reversing_mirrors_driving():
+    soil = jax.tree.map(lambda x: x[0], SOILS)
+    there = run(WHEEL, soil, Contact(), 0.04, 3.0, 0.5, 8.0)
+    back = run(WHEEL, soil, Contact(), 0.04, -3.0, 0.5, -8.0)
+    np.testing.assert_allclose(back.longitudinal, -there.longitudinal, rtol=1e-6)
+    np.testing.assert_allclose(back.torque, -there.torque, rtol=1e-6)
+    np.testing.assert_allclose([back.lateral, back.normal], [there.lateral, there.normal])
+    assert there.lateral < 0 < there.longitudinal
+
+
+def test_no_jump_from_braking_through_rolling_to_driving_and_none_at_rest():
+    soil = jax.tree.map(lambda x: x[0], SOILS)
+    omega = np.linspace(-1.0, 9.0, 2001)
+    f = run(WHEEL, soil, Contact(), 0.03, 2.0, 0.2, omega)
+    for x in jax.tree.leaves(f):
+        assert np.max(np.abs(np.diff(x))) < 0.02 * np.max(f.normal)
+
+    speed = np.linspace(-0.1, 0.1, 2001)
+    locked = run(WHEEL, soil, Contact(), 0.03, speed, 0.0, 0.0)
+    for x in jax.tree.leaves(locked):
+        assert np.max(np.abs(np.diff(x))) < 0.02 * np.max(locked.normal)
+    np.testing.assert_allclose(locked.longitudinal[1000], 0.0, atol=1e-2)
+    assert np.all(locked.longitudinal * speed <= 1e-2)  # it resists, whichever way
+
+
+def test_slip_is_defined_everywhere():
+    v, w = np.float32([1, 2, 0, 0, 1, -1, -1]), np.float32([2, 1, 0, 1, 0, -2, 0])
+    want = [0.5, -0.5, 0, 1, -1, 0.5, -1]
+    np.testing.assert_allclose(slip(v, w, 1e-4), want, atol=1e-6)
+    gradient = jax.vmap(jax.grad(slip, (0, 1)))(v, w)
+    assert np.isfinite(gradient).all()
+
+
+def test_equilibrium_carries_the_load_and_differentiates_implicitly():
+    load = np.float32([500.0, 6000.0, 3000.0])
+    motion = (4.0, 0.2, 10.0)
+
+    def sinkage(load, stiffness):
+        soils = SOILS.replace(kphi=SOILS.kphi * stiffness)
+        return equilibrium_sinkage(WHEEL, soils, Contact(), load, *motion)
+
+    solve = jax.jit(sinkage)
+    z = solve(load, 1.0)
+    np.testing.assert_allclose(run(WHEEL, SOILS, Contact(), z, *motion).normal, load, rtol=1e-3)
+    np.testing.assert_allclose(solve(np.zeros(3), 1.0), 0, atol=1e-6)
+
+    ones = np.ones(3, np.float32)
+    forward = jax.jvp(lambda x: solve(x, 1.0), (load,), (ones,))[1]
+    reverse = jax.grad(lambda x: solve(x, 1.0).sum())(load)
+    difference = (solve(1.02 * load, 1.0) - solve(0.98 * load, 1.0)) / (0.04 * load)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-5)
+    np.testing.assert_allclose(reverse, difference, rtol=0.01)
+    stiffer = jax.grad(lambda x: solve(load, x).sum())(1.0)
+    difference = (solve(load, 1.02) - solve(load, 0.98)).sum() / 0.04
+    np.testing.assert_allclose(stiffer, difference, rtol=0.02)
+
+
+def test_a_second_wheel_sinks_less_below_the_rut():
+    motion = (4.0, 0.0, 10.0)
+    contact = Contact()
+    first = equilibrium_sinkage(WHEEL, SOILS, contact, 3000.0, *motion)
+    rut = deepen(0.0, first)
+    second = equilibrium_sinkage(WHEEL, SOILS, contact, 3000.0, *motion, rut)
+    assert np.all(second > 0.9 * rut) and np.all(second - rut < 0.9 * first)
+    np.testing.assert_array_equal(deepen(rut, second), np.maximum(first, second))
+    # In deep snow compaction holds a wheel back, and less of it is left to do.
+    pull = [
+        run(WHEEL, SOILS, contact, *x).longitudinal
+        for x in ((first, *motion), (second, *motion, rut))
+    ]
+    assert pull[1][2] > pull[0][2]
+    # Unloaded above the floor of the rut; the clay's, half a millimetre deep, is all elastic.
+    assert not np.any(run(WHEEL, SOILS, contact, 0.5 * rut, *motion, rut).normal[::2])
+
+
+def test_friction_on_rigid_ground_stays_inside_its_cone():
+    key = np.random.default_rng(0)
+    vx, vy, omega = key.normal(size=(3, 1000)) * [[5], [2], [10]]
+    f = rigid_forces(WHEEL, 0.7, 6000.0, vx, vy, omega)
+    force = np.hypot(f.longitudinal, f.lateral)
+    assert np.all(force <= 0.7 * 6000 * (1 + 1e-6)) and np.max(force) > 0.99 * 0.7 * 6000
+    slip_x, slip_y = WHEEL.radius * omega - vx, -vy
+    assert np.all(f.longitudinal * slip_x + f.lateral * slip_y >= 0)
+    np.testing.assert_allclose(f.torque, WHEEL.radius * f.longitudinal)
+    rest = rigid_forces(WHEEL, 0.7, np.float32([6000.0, -10.0]), 0.0, 0.0, 0.0)
+    assert not np.any(rest.longitudinal) and rest.normal[1] == 0
+    slope = jax.grad(lambda v: rigid_forces(WHEEL, 0.7, 6000.0, v, v, 0.0).longitudinal)(0.0)
+    np.testing.assert_allclose(slope, -0.7 * 6000 / 0.05, rtol=1e-5)
