@@ -54,14 +54,16 @@ class Run:
             raise RunError(f"{root}: cannot start a run there: {error}") from error
 
     @classmethod
-    def open(cls, folder: str | Path, step: int) -> Self:
-        """Continue a run from its checkpoint at `step`: later metrics are dropped.
+    def open(cls, folder: str | Path, step: int, settings: Any) -> Self:
+        """Continue a run from its checkpoint at `step` with the dataclass `settings`.
 
-        A folder without metrics, or with damaged ones, raises `RunError`.
+        Later metrics are dropped and `config.yaml` is replaced. A folder without metrics, or with
+        damaged ones, raises `RunError`.
         """
         folder = Path(folder)
         kept = [entry for entry in read_metrics(folder) if entry["step"] <= step]
         write_atomic(folder / METRICS, "".join(json.dumps(entry) + "\n" for entry in kept))
+        write_atomic(folder / "config.yaml", config.dump(settings))
         try:
             events = _events_writer(folder)
             restart = SessionLog(status=SessionLog.START)

@@ -92,9 +92,10 @@ def load(folder: str | Path, split: Split) -> tuple[Drives, TerrainMap]:
         raise DataError(f"{folder}: expected files of equally long drives, found {sorted(steps)}")
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     if not len(joined["length"]):
+        indices = SPLITS[split]
         raise DataError(
-            f"{folder}: expected drives {SPLITS[split].start} to {SPLITS[split].stop - 1} of a file "
-            f"for the {split} split, found fewer drives in every file"
+            f"{folder}: expected drives {indices.start} to {indices.stop - 1} of a file for the "
+            f"{split} split, found fewer drives in every file"
         )
     return Drives(**joined), stack(maps)
 

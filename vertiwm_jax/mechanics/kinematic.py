@@ -1,12 +1,13 @@
 """Vehicles without forces: the baselines that every dynamics model has to beat."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax import geometry
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -30,7 +31,7 @@ class ConstantVelocity:
         twist = jnp.concatenate([state.velocity, state.angular_velocity], axis=-1)
         pose = state.pose @ geometry.exp(STEP_SECONDS * twist)
         rpy = geometry.rpy_from_rotation(pose.rotation())
-        return state.replace(position=pose.translation(), rpy=rpy), ()
+        return replace(state, position=pose.translation(), rpy=rpy), ()
 
 
 @struct.dataclass
@@ -41,6 +42,18 @@ class BicycleParams:
     track: jax.Array
     ride_height: jax.Array
     speed_lag: jax.Array
+
+
+def bicycle_of(
+    vehicle: Vehicle, ride_height: float = 0.43, speed_lag: float = 0.2
+) -> BicycleParams:
+    """The bicycle with the axles of `vehicle`; the rest, m and s, as an HMMWV drives in Chrono."""
+    return BicycleParams(
+        wheelbase=jnp.asarray(vehicle.wheelbase),
+        track=jnp.asarray(vehicle.track),
+        ride_height=jnp.float32(ride_height),
+        speed_lag=jnp.float32(speed_lag),
+    )
 
 
 @dataclass(frozen=True)

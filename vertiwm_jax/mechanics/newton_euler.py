@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax.mechanics.vector import Vector
+from vertiwm_jax.mechanics.vector import Axes, Vector
 
 
 class Twist(NamedTuple):
@@ -43,7 +43,7 @@ def advance_twist(
     contacts: list[ContactForce],
     seconds: float,
 ) -> Twist:
-    """The body's twist after one linearly implicit Euler step.
+    """The body's twist after one linearly implicit Euler step, in the axes it had before.
 
     (M + dt sum_c D_c J_c^T J_c) dv = dt (f + sum_c F_c J_c^T), with J_c = [d, r x d]: the damping
     of every contact acts on the new velocity, so stiff springs and sticking friction are stable
@@ -51,13 +51,9 @@ def advance_twist(
 
     inertia: principal moments about the centre of mass, kg m2; gravity: m/s2, body components.
     """
-    v, w = twist
-    spin = Vector(inertia.x * w.x, inertia.y * w.y, inertia.z * w.z)
-    force = gravity.plus(w.cross(v), -1.0).times(mass)
-    moment = w.cross(spin).times(-1.0)
-    rhs = [*force, *moment]
     diagonal = [mass, mass, mass, *inertia]
     zero = jnp.zeros_like(mass)
+    rhs = [*gravity.times(mass), zero, zero, zero]
     matrix = [[diagonal[i] if i == j else zero for j in range(i + 1)] for i in range(6)]
     for contact in contacts:
         jacobian = (*contact.direction, *contact.arm.cross(contact.direction))
@@ -67,7 +63,20 @@ def advance_twist(
             for j in range(i + 1):
                 matrix[i][j] = matrix[i][j] + jnp.sum(weighted * jacobian[j], axis=-1)
     change = _solve_spd(matrix, [seconds * r for r in rhs])
-    return Twist(v.plus(Vector(*change[:3])), w.plus(Vector(*change[3:])))
+    linear, angular = Vector(*change[:3]), Vector(*change[3:])
+    return Twist(twist.linear.plus(linear), twist.angular.plus(angular))
+
+
+def turned(twist: Twist, inertia: Vector, turn: Axes) -> Twist:
+    """A free body's twist in its axes after they have turned by `turn`.
+
+    Linear and angular momentum keep their length exactly, which the explicit gyroscopic terms
+    -w x v and -w x I w do not: those blow up a tumbling body.
+    """
+    w = twist.angular
+    momentum = turn.to_body(Vector(inertia.x * w.x, inertia.y * w.y, inertia.z * w.z))
+    angular = Vector(momentum.x / inertia.x, momentum.y / inertia.y, momentum.z / inertia.z)
+    return Twist(turn.to_body(twist.linear), angular)
 
 
 def _solve_spd(lower: list[list[jax.Array]], rhs: list[jax.Array]) -> list[jax.Array]:

@@ -15,7 +15,13 @@ import jaxlie
 from flax import struct
 
 from vertiwm_jax import geometry
-from vertiwm_jax.mechanics.newton_euler import ContactForce, Twist, advance_twist, velocity_at
+from vertiwm_jax.mechanics.newton_euler import (
+    ContactForce,
+    Twist,
+    advance_twist,
+    turned,
+    velocity_at,
+)
 from vertiwm_jax.mechanics.touch import Touch, touch
 from vertiwm_jax.mechanics.vector import Axes, Vector
 from vertiwm_jax.mechanics.vehicle import Vehicle
@@ -37,9 +43,9 @@ LARGEST_LOAD = 2.5
 """Largest normal force on one wheel, in vehicle weights."""
 LEAST_UPRIGHT = 0.2
 """Cosine between body and ground normal below which wheels no longer carry."""
-BELLY_SECONDS = 0.1
-"""Time in which the belly, standing on ground, would drop by its depth under the weight."""
-BELLY_FRICTION = 0.5
+HULL_SECONDS = 0.1
+"""Time in which the hull, lying on ground, would drop by its depth under the weight."""
+HULL_FRICTION = 0.5
 
 
 @struct.dataclass
@@ -69,11 +75,11 @@ def chrono_like(vehicle: Vehicle) -> SimulatorParams:
     return SimulatorParams(
         vehicle=jax.tree.map(jnp.asarray, vehicle),
         contact=Contact(
-            peak=0.3, peak_slip=0.05, exit=-0.13, unload_stiffness=7e6, creep_speed=ADHESION_SPEED
+            peak=0.16, peak_slip=0.0, exit=-0.16, unload_stiffness=3e6, creep_speed=ADHESION_SPEED
         ),
-        stiffening=jnp.float32(12.0),
-        shear_scale=jnp.float32(0.85),
-        upright_stress=jnp.float32(0.8),
+        stiffening=jnp.float32(4.4),
+        shear_scale=jnp.float32(0.4),
+        upright_stress=jnp.float32(0.57),
     )
 
 
@@ -172,7 +178,7 @@ def _substep(
     steering = history.steering + jnp.clip(target - history.steering, -turn, turn)
 
     steer = jnp.concatenate([jnp.full(2, steering), jnp.zeros(2)])
-    wheels, belly = touch(vehicle, terrain, body.position, axes, history.travel, steer)
+    wheels, hull = touch(vehicle, terrain, body.position, axes, history.travel, steer)
     n, arm = wheels.normal, wheels.point.plus(centre, -1.0)
     rolling, lateral = _tangents(n, jnp.cos(steer), jnp.sin(steer))
     velocity = velocity_at(body.twist, arm)
@@ -198,7 +204,7 @@ def _substep(
         ContactForce(n, arm, load, seconds * rate),
         ContactForce(rolling, arm, traction, traction_rate),
         ContactForce(lateral, arm, ground.lateral, grip),
-        *_belly_contact(vehicle, body.twist, belly, centre, seconds),
+        *_hull_contact(vehicle, body.twist, hull, centre, seconds),
     ]
     gravity = Vector(axes.x.z, axes.y.z, axes.z.z).times(-GRAVITY)
     twist = advance_twist(
@@ -213,12 +219,16 @@ def _substep(
         wheel_speed=history.wheel_speed
         + spin_up
         + seconds * radius * grip * gained.dot(rolling) / inertia,
-        travel=press.droop + jnp.where(press.carrying, pushed / press.upright, 0.0),
+        travel=jnp.clip(
+            press.droop + jnp.where(press.carrying, pushed / press.upright, 0.0),
+            vehicle.free_travel - radius,
+            vehicle.free_travel + radius,
+        ),
         steering=steering,
         sinkage=sinkage,
         rut=history.rut + fresh * (sinkage[:2] - history.rut),
     )
-    return _advance_pose(body, axes, centre, twist, seconds), history
+    return _advance_pose(vehicle, body, axes, centre, twist, seconds), history
 
 
 class _Press(NamedTuple):
@@ -295,7 +305,9 @@ def _support(
 
     friction = jnp.minimum(wheels.friction, vehicle.tyre_friction)
     on_rock = rigid_forces(wheel, friction, load, ahead, drift, spin, ADHESION_SPEED)
-    ground = jax.tree.map(lambda a, b: jnp.where(wheels.soft, a, b), in_soil, on_rock)
+    # Soil shears under the load that is really on it, whatever the sinkage says for now.
+    loaded = jnp.minimum(load / jnp.maximum(in_soil.normal, 1.0), 1.0)
+    ground = jax.tree.map(lambda a, b: jnp.where(wheels.soft, loaded * a, b), in_soil, on_rock)
     return ground, sinkage, load, rate
 
 
@@ -313,10 +325,12 @@ def _drivetrain(
 ) -> tuple[jax.Array, jax.Array]:
     """Driving torque on each wheel, N m, and braking torque per wheel speed, N m s/rad `[4]`.
 
-    Open differentials: all wheels get the same torque, limited by power at their mean speed.
+    Open differentials: all wheels get the same torque, limited by power at their mean speed;
+    the engine fades out over the upper half of its speed range.
     """
     mean_speed = jnp.maximum(jnp.abs(jnp.mean(wheel_speed)), 1.0)
     torque = jnp.minimum(vehicle.wheel_torque, vehicle.wheel_power / mean_speed)
+    torque = torque * jnp.clip(2 - 2 * mean_speed / vehicle.wheel_speed_limit, 0.0, 1.0)
     brake = vehicle.brake_torque / (jnp.abs(wheel_speed) + SPIN_FLOOR)
     return jnp.maximum(pedal, 0.0) * torque, jnp.maximum(-pedal, 0.0) * brake
 
@@ -328,20 +342,24 @@ def _tangents(normal: Vector, cos: jax.Array, sin: jax.Array) -> tuple[Vector, V
     return along, normal.cross(along)
 
 
-def _belly_contact(
-    vehicle: Vehicle, twist: Twist, belly: Touch, centre: Vector, seconds: float
+def _hull_contact(
+    vehicle: Vehicle, twist: Twist, hull: Touch, centre: Vector, seconds: float
 ) -> list[ContactForce]:
-    """The chassis on rigid ground: a heavily damped spring, and friction. Soil gives way."""
-    arm, n = belly.point.plus(centre, -1.0), belly.normal
+    """The chassis on the ground: a heavily damped spring, and friction.
+
+    Soil gives way under the belly, as in Chrono, whose SCM feels wheels only; not on the roof.
+    """
+    arm, n = hull.point.plus(centre, -1.0), hull.normal
     forward, left = _tangents(n, jnp.ones(1), jnp.zeros(1))
     velocity = velocity_at(twist, arm)
-    stiffness = 2 * vehicle.mass / BELLY_SECONDS**2
-    rate = stiffness * (seconds + BELLY_SECONDS)
-    load = stiffness * belly.depth - rate * velocity.dot(n)
-    pressing = (belly.depth > 0) & (load > 0) & ~belly.soft
+    stiffness = 2 * vehicle.mass / HULL_SECONDS**2
+    rate = stiffness * (seconds + HULL_SECONDS)
+    load = stiffness * hull.depth - rate * velocity.dot(n)
+    load = jnp.minimum(load, LARGEST_LOAD * vehicle.mass * GRAVITY)
+    pressing = (hull.depth > 0) & (load > 0) & ~(hull.soft & (n.z > 0))
     load, rate = jnp.where(pressing, load, 0.0), jnp.where(pressing, rate, 0.0)
     ahead, drift = velocity.dot(forward), velocity.dot(left)
-    grip = BELLY_FRICTION * load * jax.lax.rsqrt(ahead**2 + drift**2 + ADHESION_SPEED**2)
+    grip = HULL_FRICTION * load * jax.lax.rsqrt(ahead**2 + drift**2 + ADHESION_SPEED**2)
     return [
         ContactForce(n, arm, load, rate),
         ContactForce(forward, arm, -grip * ahead, grip),
@@ -349,11 +367,13 @@ def _belly_contact(
     ]
 
 
-def _advance_pose(body: _Body, axes: Axes, centre: Vector, twist: Twist, seconds: float) -> _Body:
+def _advance_pose(
+    vehicle: Vehicle, body: _Body, axes: Axes, centre: Vector, twist: Twist, seconds: float
+) -> _Body:
     """Moves the centre of mass by the new velocity and turns the body about it."""
-    w = twist.angular.stacked()
-    rotation = jaxlie.SO3(body.quaternion) @ jaxlie.SO3.exp(seconds * w)
-    quaternion = rotation.normalize().wxyz
+    turn = jaxlie.SO3.exp(seconds * twist.angular.stacked())
+    quaternion = (jaxlie.SO3(body.quaternion) @ turn).normalize().wxyz
     at_centre = body.position.plus(axes.to_world(centre.plus(twist.linear, seconds)))
     position = at_centre.plus(Axes.from_quaternion(quaternion).to_world(centre), -1.0)
-    return _Body(position, quaternion, twist)
+    inertia = Vector.of(vehicle.inertia)
+    return _Body(position, quaternion, turned(twist, inertia, Axes.from_quaternion(turn.wxyz)))

@@ -233,7 +233,8 @@ def reloading(contact: Contact, keq: Scalar, n: Scalar, rut: Scalar) -> tuple[ja
     # Rebound never lifts the floor above the undisturbed surface.
     stiffness = contact.unload_stiffness + contact.unload_slope * deepest
     stiffness = jnp.maximum(stiffness, pressure / deepest)
-    floor = jnp.where(compacted, deepest - pressure / stiffness, 0.0)
+    # Rounding must not lift it either: a negative depth has no power.
+    floor = jnp.where(compacted, jnp.maximum(deepest - pressure / stiffness, 0.0), 0.0)
     return floor, jnp.where(compacted, stiffness, 1e15)
 
 

@@ -1,4 +1,4 @@
-"""Where a vehicle touches the ground: its treads and its belly against the map."""
+"""Where a vehicle touches the ground: its treads and its hull against the map."""
 
 from typing import NamedTuple
 
@@ -43,7 +43,7 @@ def touch(
     travel: jax.Array,
     steering: jax.Array,
 ) -> tuple[Touch, Touch]:
-    """Contacts of the four wheels `[4]` and of the deepest belly point `[1]`, in one query.
+    """Contacts of the four wheels `[4]` and of the deepest hull point `[1]`, in one query.
 
     A wheel is a cylinder. Testing points on both rims, rather than the ground under the hub,
     lets it roll over edges and stand on a rim; neighbouring points of like depth share the
@@ -51,9 +51,9 @@ def touch(
 
     travel: `[4]` m, height of the wheel centres in the body; steering: `[4]` rad.
     """
-    tread, belly = _tread(vehicle, travel, steering), Vector.of(vehicle.belly)
+    tread, hull = _tread(vehicle, travel, steering), Vector.of(vehicle.hull)
     shape, count = tread.x.shape, tread.x.size
-    points = Vector(*(jnp.concatenate([a.ravel(), b]) for a, b in zip(tread, belly, strict=True)))
+    points = Vector(*(jnp.concatenate([a.ravel(), b]) for a, b in zip(tread, hull, strict=True)))
     world = position.plus(axes.to_world(points))
     ground = query.surface(terrain, jnp.stack([world.x, world.y], axis=-1))
     slope_x, slope_y = ground.gradient[:, 0], ground.gradient[:, 1]

@@ -27,9 +27,10 @@ class Vehicle:
     steering_limit: `[]` rad; steering_rate: `[]` rad/s, both at the front wheels.
     speed_gain: `[]` s/m, pedal per speed error; full pedal is 1.
     wheel_torque: `[]` N m a wheel at full throttle; wheel_power: `[]` W a wheel at most.
+    wheel_speed_limit: `[]` rad/s, mean wheel speed beyond which the engine gives nothing.
     brake_torque: `[]` N m a wheel at full braking.
     tyre_friction: `[]` the tyre's own friction coefficient; contact takes the smaller one.
-    belly: `[P, 3]` m, points under the chassis that touch the ground first.
+    hull: `[P, 3]` m, points of the chassis that touch the ground first, underside and roof.
     length, width: `[]` m, the rectangle that collides with obstacles, centred on the origin.
     """
 
@@ -49,9 +50,10 @@ class Vehicle:
     speed_gain: jax.Array
     wheel_torque: jax.Array
     wheel_power: jax.Array
+    wheel_speed_limit: jax.Array
     brake_torque: jax.Array
     tyre_friction: jax.Array
-    belly: jax.Array
+    hull: jax.Array
     length: jax.Array
     width: jax.Array
 
@@ -76,8 +78,9 @@ def _corners(x: float, y: float) -> list[tuple[float, float]]:
     return [(x, y), (x, -y), (-x, y), (-x, -y)]
 
 
-def _underside(x: float, y: float, z: float) -> list[tuple[float, float, float]]:
-    return [(i * x, j * y, z) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+def _hull(x: float, y: float, belly: float, roof: float) -> list[tuple[float, float, float]]:
+    underside = [(i * x, j * y, belly) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    return underside + [(i * x, j * y, roof) for i in (-1, 1) for j in (-1, 1)]
 
 
 def hmmwv() -> Vehicle:
@@ -104,9 +107,10 @@ def hmmwv() -> Vehicle:
         speed_gain=1.0,
         wheel_torque=6400.0,
         wheel_power=45e3,
+        wheel_speed_limit=100.0,
         brake_torque=4000.0,
         tyre_friction=0.9,
-        belly=_underside(1.0, 0.5, 0.0),
+        hull=_hull(1.0, 0.5, 0.0, 1.2),
         length=4.6,
         width=2.1,
     )

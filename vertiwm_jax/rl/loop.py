@@ -54,6 +54,21 @@ class TrainingInterrupted(RuntimeError):
     """The user stopped the training; the message says where it was saved."""
 
 
+def restore(
+    algorithm: Algorithm[State], env_params: Any, folder: Path, seeds: int
+) -> tuple[int, State] | None:
+    """Iterations done and state in the newest checkpoint of the run in `folder`, if it has one.
+
+    A checkpoint of another configuration raises `CheckpointError`.
+    """
+    checkpoint = checkpoints.latest(folder / "checkpoints")
+    if checkpoint is None:
+        return None
+    keys = jax.random.split(jax.random.key(0), seeds)
+    like = jax.eval_shape(jax.vmap(algorithm.init, (None, 0)), env_params, keys)
+    return int(checkpoint.name), checkpoints.load(checkpoint, like)
+
+
 def train(
     algorithm: Algorithm[State],
     env_params: Any,
@@ -62,8 +77,9 @@ def train(
     iterations: int,
     transitions: int,
     config: LoopConfig,
+    restored: tuple[int, State] | None = None,
 ) -> State:
-    """Trains until `iterations` are done, from the run's newest checkpoint if it has one.
+    """Trains until `iterations` are done, from the beginning or from what `restore` gave.
 
     transitions: environment steps of one seed in one iteration, for rates and metrics.
     Gives the final state; every leaf has a leading axis of seeds. Metrics are means over seeds.
@@ -71,12 +87,11 @@ def train(
     stops at once. Weights that are no longer finite raise `TrainingError`.
     """
     folder = run.folder / "checkpoints"
-    keys = jax.random.split(key, config.seeds)
-    init = jax.jit(jax.vmap(algorithm.init, (None, 0)))
-    like = jax.eval_shape(init, env_params, keys)
-    checkpoint = checkpoints.latest(folder)
-    done = int(checkpoint.name) if checkpoint else 0
-    state = checkpoints.load(checkpoint, like) if checkpoint else init(env_params, keys)
+    if restored:
+        done, state = restored
+    else:
+        init = jax.jit(jax.vmap(algorithm.init, (None, 0)))
+        done, state = 0, init(env_params, jax.random.split(key, config.seeds))
     if done >= iterations:
         return state
 

@@ -1,0 +1,117 @@
+"""`python -m vertiwm_jax.evaluate`: how well a model predicts, and how well a policy drives."""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from vertiwm_jax import config as configuration
+from vertiwm_jax import ppo, runs
+from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.evaluation import prediction, report
+from vertiwm_jax.evaluation.navigation import Policy
+from vertiwm_jax.learning import dataset
+from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
+from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.ppo import TrainConfig
+from vertiwm_jax.rl import ground
+from vertiwm_jax.rl.checkpoints import CheckpointError
+from vertiwm_jax.runs import RunError
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.worlds import Difficulty
+
+Model = Literal["builtin"]
+Named = tuple[str, Dynamics, Params]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Open-loop position errors of a model on recorded drives, beside two kinematic baselines."""
+
+    data: Path
+    """Folder of `.npz` files of drives, with the maps they name."""
+    model: Model = "builtin"
+    """The model."""
+    split: dataset.Split = "test"
+    """Which of the drives."""
+    context: int = 16
+    """Recorded steps that a model sees first."""
+    horizon: int = 16
+    """Steps that it predicts."""
+    stride: int = 16
+    """Steps from one window to the next."""
+    json: Path | None = None
+    """File to write the numbers to."""
+
+    def __post_init__(self):
+        for name, least in (("context", 0), ("horizon", 1), ("stride", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, found {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Navigation:
+    """Success, time, roll and pitch of a policy, on worlds that it was not trained on.
+
+    The worlds are those held out of the policy's training, unless others are asked for.
+    """
+
+    policy: Literal["straight", "random"] | Path
+    """Folder of a training run, or a controller that has learned nothing."""
+    worlds: Path | None = None
+    """A Verti-Bench checkout or a folder of .npz maps, to drive on all of them."""
+    difficulties: tuple[Difficulty, ...] = ()
+    """Draws new procedural worlds of these difficulties."""
+    pairs: int | None = None
+    """Tasks in a world; as many as after training by default."""
+    json: Path | None = None
+    """File to write the numbers to."""
+
+    def __post_init__(self):
+        if self.worlds and self.difficulties:
+            raise ValueError("difficulties: are drawn, give them or worlds")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; expected failures end in one line and a status that is not 0."""
+    command = tyro.cli(
+        Prediction | Navigation,
+        args=argv,
+        prog="python -m vertiwm_jax.evaluate",
+        description=__doc__,
+        config=(tyro.conf.FlagConversionOff,),
+    )
+    try:
+        if isinstance(command, Prediction):
+            numbers = _predict(command)
+        else:
+            numbers = _navigate(command)
+        if command.json:
+            runs.write_atomic(command.json, json.dumps(numbers, indent=2) + "\n")
+    except (ppo.InputError, RunError, CheckpointError) as error:
+        sys.exit(f"error: {error}")
+
+
+def _model(name: Model) -> Named:
+    params = {"builtin": lambda: (Simulator(), chrono_like(hmmwv()))}
+    return name, *params[name]()
+
+
+def _predict(command: Prediction) -> dict[str, Any]:
+    with ppo.input_errors():
+        drives, terrain = dataset.load(command.data, command.split)
+        windows = dataset.cut(drives, terrain, command.context, command.horizon, command.stride)
+    models = (
+        _model(command.model),
+        ("kinematic bicycle", KinematicBicycle(), bicycle_of(hmmwv())),
+        ("constant velocity", ConstantVelocity(), None),
+    )
+    rows = [prediction.evaluate(*model, terrain, windows) for model in models]
+    print(prediction.format_table(rows, command.horizon))
+    return {row.name: dataclasses.asdict(row) for row in rows}
