@@ -15,6 +15,7 @@ from gymnax.environments import environment, spaces
 from benchmarks._harness import Figures, measure, parser, report
 from vertiwm_jax import ppo as door
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.rl import task
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 
 
@@ -53,7 +54,7 @@ def main() -> None:
     config = door.TrainConfig()
     params = environment.EnvParams(max_steps_in_episode=600)
     results = {"algorithm alone": iteration(IdleEnv(), params, config.ppo)}
-    env, params, _ = door.environment(config)
+    env, params, _ = task.environments(config)
     results["built-in simulator"] = iteration(env, params, config.ppo)
     report("ppo_throughput", results, arguments.json)
 

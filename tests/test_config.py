@@ -2,6 +2,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -119,6 +120,12 @@ def test_what_is_saved_is_read_back_equal(tmp_path_factory, name, rate, clip, la
     task = Task(name, layers=layers, optimizer=Optimizer(rate, clip))
     config.save(task, path)
     assert config.load(Task, path) == task
+
+
+def test_numbers_of_numpy_are_saved_as_plain_ones():
+    task = Task("x", np.int32(3), layers=(np.int64(8),), optimizer=Optimizer(np.float64(0.5)))
+    plain = Task("x", 3, layers=(8,), optimizer=Optimizer(0.5))
+    assert config.dump(task) == config.dump(plain)
 
 
 def test_the_command_line_overrides_the_file(tmp_path):

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,20 +14,18 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import ppo, runs
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.evaluation import prediction, report
-from vertiwm_jax.evaluation.navigation import Policy
+from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.ppo import TrainConfig
-from vertiwm_jax.rl import ground
+from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.checkpoints import CheckpointError
 from vertiwm_jax.runs import RunError
-from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.worlds import Difficulty
 
 Model = Literal["builtin"]
-Named = tuple[str, Dynamics, Params]
 
 
 @dataclass(frozen=True)
@@ -88,30 +86,62 @@ def main(argv: Sequence[str] | None = None) -> None:
         config=(tyro.conf.FlagConversionOff,),
     )
     try:
-        if isinstance(command, Prediction):
-            numbers = _predict(command)
-        else:
-            numbers = _navigate(command)
+        numbers = _predict(command) if isinstance(command, Prediction) else _navigate(command)
         if command.json:
             runs.write_atomic(command.json, json.dumps(numbers, indent=2) + "\n")
-    except (ppo.InputError, RunError, CheckpointError) as error:
+    except (RunError, CheckpointError) as error:
         sys.exit(f"error: {error}")
 
 
-def _model(name: Model) -> Named:
-    params = {"builtin": lambda: (Simulator(), chrono_like(hmmwv()))}
-    return name, *params[name]()
+def _model(name: Model) -> tuple[Dynamics, Params]:
+    match name:
+        case "builtin":
+            return Simulator(), chrono_like(hmmwv())
 
 
 def _predict(command: Prediction) -> dict[str, Any]:
-    with ppo.input_errors():
+    try:
         drives, terrain = dataset.load(command.data, command.split)
         windows = dataset.cut(drives, terrain, command.context, command.horizon, command.stride)
-    models = (
-        _model(command.model),
-        ("kinematic bicycle", KinematicBicycle(), bicycle_of(hmmwv())),
-        ("constant velocity", ConstantVelocity(), None),
-    )
-    rows = [prediction.evaluate(*model, terrain, windows) for model in models]
+    except ValueError as error:  # what is wrong with the drives, or with their maps
+        sys.exit(f"error: {error}")
+    models: dict[str, tuple[Dynamics, Params]] = {
+        command.model: _model(command.model),
+        "kinematic bicycle": (KinematicBicycle(), bicycle_of(hmmwv())),
+        "constant velocity": (ConstantVelocity(), None),
+    }
+    rows = [prediction.evaluate(name, *models[name], terrain, windows) for name in models]
     print(prediction.format_table(rows, command.horizon))
     return {row.name: dataclasses.asdict(row) for row in rows}
+
+
+def _navigate(command: Navigation) -> dict[str, Any]:
+    run = command.policy if isinstance(command.policy, Path) else None
+    file = run / "config.yaml" if run else configuration.default_config("ppo")
+    try:
+        config = _adapted(configuration.load(TrainConfig, file), command)
+        terrain = ground.load(command.worlds) if command.worlds else task.held_out(config)
+        env, test = task.test_environment(config, terrain)
+    except ValueError as error:  # what is wrong with configuration, maps, or tasks on them
+        sys.exit(f"error: {error}")
+    policies = baselines(config.navigation)
+    if run:
+        policies = ppo.learned(config, env, test, run) | policies
+    elif command.policy == "straight":
+        policies = {REFERENCE: policies[REFERENCE]}
+    groups = report.drive(env, test, policies, config.key("testing"))
+    print(f"\n{report.markdown(groups, REFERENCE)}")
+    return report.summary(groups, REFERENCE)
+
+
+def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:
+    """The configuration of a training with the ground that the command asks for."""
+    grounds = replace(config.ground, pairs=command.pairs or config.ground.pairs)
+    if not command.difficulties:
+        return replace(config, ground=grounds)
+    procedural = replace(grounds.procedural, difficulties=command.difficulties)
+    return replace(config, worlds=None, ground=replace(grounds, procedural=procedural))
+
+
+if __name__ == "__main__":
+    main()

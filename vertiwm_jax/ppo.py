@@ -4,7 +4,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
@@ -12,22 +12,21 @@ import numpy as np
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv, NavigationParams
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
 from vertiwm_jax.evaluation import plots, report
-from vertiwm_jax.evaluation.controllers import RandomActions, StraightToGoal
-from vertiwm_jax.evaluation.navigation import NavigationResult, evaluate
-from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.rl import checkpoints, ground
+from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
+from vertiwm_jax.evaluation.navigation import Policy
+from vertiwm_jax.evaluation.report import Results, drive
+from vertiwm_jax.rl import task
 from vertiwm_jax.rl.checkpoints import CheckpointError
-from vertiwm_jax.rl.ground import GroundConfig
-from vertiwm_jax.rl.loop import LoopConfig, TrainingError, TrainingInterrupted, train
-from vertiwm_jax.rl.ppo import PPO, Metrics, PPOConfig
+from vertiwm_jax.rl.loop import LoopConfig, TrainingError, TrainingInterrupted, restore, train
+from vertiwm_jax.rl.ppo import PPO, PPOConfig, TrainState
+from vertiwm_jax.rl.task import TaskConfig
 from vertiwm_jax.runs import Run, RunError
 from vertiwm_jax.state import STEP_SECONDS
 
-REFERENCE = "straight to goal"
+Rows = dict[str, Policy]
+
 CURVES = {
     "episode_return": "return",
     "success": "success",
@@ -39,25 +38,15 @@ CURVES = {
 
 
 @dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(TaskConfig):
     """Train an off-road driving policy by PPO inside the built-in simulator."""
 
-    seed: int = 0
-    """Decides everything that is random."""
-    worlds: Path | None = None
-    """A Verti-Bench checkout or a folder of .npz maps; procedural worlds by default."""
     runs: Path = Path("runs")
     """Folder in which the folder of this run is made."""
     resume: Path | None = None
-    """Folder of an earlier run to go on with; its configuration holds, save what is set beside."""
+    """Folder of an earlier run to go on with; what is set beside changes its configuration."""
     compile_cache: Path | None = None
     """Folder that keeps compiled programs for later runs."""
-    ground: GroundConfig = GroundConfig()
-    """What worlds and tasks."""
-    navigation: NavigationConfig = NavigationConfig()
-    """What the task is."""
-    simulator: Simulator = Simulator()
-    """What moves the vehicle."""
     ppo: PPOConfig = PPOConfig()
     """The algorithm."""
     loop: LoopConfig = LoopConfig()
@@ -80,14 +69,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     print(f"all of it is in {run_folder}")
 
 
-def outcomes(info: dict[str, jax.Array]) -> Metrics:
-    """What is reported of an episode's last step."""
-    ending = info["ending"]
-    return {
-        "success": ending == Ending.GOAL,
-        "timed_out": ending == Ending.TIMED_OUT,
-        "final_distance": info["distance"],
-    }
+def learned(config: TrainConfig, env: NavigationEnv, params: NavigationParams, run: Path) -> Rows:
+    """The policies of the run in the folder `run`, one a seed; `CheckpointError` if none."""
+    algorithm = _algorithm(config, env)
+    restored = restore(algorithm, params, run, config.loop.seeds)
+    if restored is None:
+        raise CheckpointError(f"{run}: expected checkpoints of a training, found none")
+    return _policies(config, algorithm, params, restored[1])
 
 
 def _configuration(argv: Sequence[str] | None) -> TrainConfig:
@@ -98,75 +86,59 @@ def _configuration(argv: Sequence[str] | None) -> TrainConfig:
     return configuration.parse(TrainConfig, file, argv, "python -m vertiwm_jax.ppo")
 
 
-def environment(config: TrainConfig) -> tuple[NavigationEnv, NavigationParams, NavigationParams]:
-    """The environment, its parameters to train with, and those to test with."""
-    world_key, task_key = jax.random.split(jax.random.key(config.seed))
-    env = NavigationEnv(config.simulator, config.navigation)
-    params = chrono_like(hmmwv())
-    terrain, held_out = ground.grounds(config.ground, config.worlds, world_key)
-    chassis = config.navigation.chassis
-    tasks = ground.training_tasks(config.ground, terrain, chassis, task_key)
-    test_tasks = ground.test_tasks(config.ground, held_out)
-    return (
-        env,
-        env.make_params(params, terrain, tasks),
-        env.make_params(params, held_out, test_tasks),
-    )
+def _algorithm(config: TrainConfig, env: NavigationEnv) -> PPO:
+    return PPO(env, config.ppo, task.outcomes)
+
+
+def _policies(
+    config: TrainConfig, algorithm: PPO, params: NavigationParams, state: TrainState
+) -> Rows:
+    names = [f"ppo, seed {seed}" for seed in range(config.loop.seeds)]
+    return {
+        name: algorithm.policy(params, jax.tree.map(lambda x, seed=seed: x[seed], state))
+        for seed, name in enumerate(names if len(names) > 1 else ["ppo"])
+    }
 
 
 def _train_and_report(config: TrainConfig) -> Path:
     if config.compile_cache:
         jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
     try:
-        env, params, test = environment(config)
+        env, params, test = task.environments(config)
     except ValueError as error:  # what is wrong with the maps, or with the tasks on them
         sys.exit(f"error: {error}")
-    algorithm = PPO(env, config.ppo, outcomes)
-    train_key, test_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1))
-    iterations, batch = config.ppo.iterations, config.ppo.batch
-    with _open(config) as run:
+    algorithm = _algorithm(config, env)
+    seeds, iterations, batch = config.loop.seeds, config.ppo.iterations, config.ppo.batch
+    restored = restore(algorithm, params, config.resume, seeds) if config.resume else None
+    with _open(config, restored[0] if restored else 0) as run:
         print(f"run folder {run.folder}; training on {params.terrain.worlds} worlds", flush=True)
-        state = train(algorithm, params, train_key, run, iterations, batch, config.loop)
-        seeds = range(config.loop.seeds)
-        policies = {
-            "ppo" if len(seeds) == 1 else f"ppo, seed {seed}": algorithm.policy(
-                params, jax.tree.map(lambda x, seed=seed: x[seed], state)
-            )
-            for seed in seeds
-        }
-        policies |= {REFERENCE: StraightToGoal(config.navigation), "random": RandomActions()}
-        tested = f"{test.pool_size} tasks on {test.terrain.worlds} worlds not trained on"
-        print(f"driving {tested} ...", flush=True)
-        results = {name: evaluate(env, test, p, test_key) for name, p in policies.items()}
-        _report(run, config, test, results)
+        key = config.key("training")
+        state = train(algorithm, params, key, run, iterations, batch, config.loop, restored)
+        policies = _policies(config, algorithm, params, state) | baselines(config.navigation)
+        _report(run, config, test, drive(env, test, policies, config.key("testing")))
     return run.folder
 
 
-def _open(config: TrainConfig) -> Run:
+def _open(config: TrainConfig, done: int) -> Run:
+    settings = replace(config, resume=None)
     if config.resume is None:
-        return Run.create(config.runs, "ppo", config)
-    newest = checkpoints.latest(config.resume / "checkpoints")
-    return Run.open(config.resume, int(newest.name) if newest else 0)
+        return Run.create(config.runs, "ppo", settings)
+    return Run.open(config.resume, done, settings)
 
 
 def _report(
-    run: Run,
-    config: TrainConfig,
-    test: NavigationParams,
-    results: dict[str, NavigationResult],
+    run: Run, config: TrainConfig, test: NavigationParams, groups: Mapping[str, Results]
 ) -> None:
-    groups = report.by_difficulty(results, ground.difficulties(test.terrain))
     table = report.markdown(groups, REFERENCE)
     print(f"\n{table}\n")
     runs.write_atomic(run.folder / "summary.md", table + "\n")
     numbers = json.dumps(report.summary(groups, REFERENCE), indent=2)
     runs.write_atomic(run.folder / "summary.json", numbers + "\n")
-
     _draw(run, config, test, groups)
 
 
 def _draw(
-    run: Run, config: TrainConfig, test: NavigationParams, groups: Mapping[str, report.Results]
+    run: Run, config: TrainConfig, test: NavigationParams, groups: Mapping[str, Results]
 ) -> None:
     """Learning curves, and for each difficulty a drive to a goal that is hard to reach."""
     metrics = runs.read_metrics(run.folder)
@@ -174,19 +146,19 @@ def _draw(
     columns = {name: [line.get(name, np.nan) for line in metrics] for name in names}
     labels = {name: label for name, label in CURVES.items() if name in columns}
     figure = plots.learning_curves({"ppo": columns}, "transitions", labels, "transitions")
-    figure.savefig(run.folder / "learning_curves.png")
+    plots.save(figure, run.folder / "learning_curves.png")
     for name, results in groups.items():
         reference = results[REFERENCE]
-        task = int(np.argmin(reference.success))  # the first failure, if there is one
+        hard = int(np.argmin(reference.success))  # the first failure, if there is one
         figure = plots.trajectories(
             test.terrain,
-            int(reference.world[task]),
-            {policy: result.path(task) for policy, result in results.items()},
-            np.asarray(reference.goal[task]),
+            int(reference.world[hard]),
+            {policy: result.path(hard) for policy, result in results.items()},
+            np.asarray(reference.goal[hard]),
             config.navigation.goal_radius,
             STEP_SECONDS,
         )
-        figure.savefig(run.folder / f"trajectories_{name}.png")
+        plots.save(figure, run.folder / f"trajectories_{name}.png")
 
 
 if __name__ == "__main__":

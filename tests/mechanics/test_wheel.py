@@ -251,3 +251,17 @@ def test_friction_on_rigid_ground_stays_inside_its_cone():
     assert not np.any(rest.longitudinal) and rest.normal[1] == 0
     slope = jax.grad(lambda v: rigid_forces(WHEEL, 0.7, 6000.0, v, v, 0.0).longitudinal)(0.0)
     np.testing.assert_allclose(slope, -0.7 * 6000 / 0.05, rtol=1e-5)
+
+
+def test_forces_in_a_soft_rut_are_finite_at_every_rounding() -> None:
+    # A reloading stiffness below the soil's own puts the floor of the rut at the surface, where
+    # one rounding error below zero had no power.
+    key = jax.random.split(jax.random.key(0), 3)
+    rut = jax.random.uniform(key[0], (200_000,), maxval=0.05)
+    sinkage = jnp.abs(rut + 0.01 * jax.random.normal(key[1], rut.shape))
+    speed = jax.random.uniform(key[2], rut.shape, maxval=5.0)
+    contact = Contact(unload_stiffness=1e6)
+    wheel, soil = Wheel(radius=0.467, width=0.254), PRESETS["mud"]
+    out = jax.jit(forces)(wheel, soil, contact, sinkage, speed, 0.1, 1.2 * speed / 0.467, rut)
+    for name, values in vars(out).items():
+        assert jnp.all(jnp.isfinite(values)), name

@@ -10,7 +10,7 @@ from rl.probes import Broken, ProbeParams, Target
 
 from vertiwm_jax import runs
 from vertiwm_jax.rl import checkpoints
-from vertiwm_jax.rl.loop import LoopConfig, TrainingError, TrainingInterrupted, train
+from vertiwm_jax.rl.loop import LoopConfig, TrainingError, TrainingInterrupted, restore, train
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.runs import Run
 
@@ -42,7 +42,8 @@ def new_run(tmp_path):
 
 def go(algorithm, run, iterations, env_params=ProbeParams(), **config):
     config = LoopConfig(**{"seeds": 2, "checkpoint_every": 4, **config})
-    return train(algorithm, env_params, jax.random.key(0), run, iterations, 32, config)
+    restored = restore(algorithm, env_params, run.folder, config.seeds)
+    return train(algorithm, env_params, jax.random.key(0), run, iterations, 32, config, restored)
 
 
 def interrupt_at(monkeypatch, iteration):
@@ -65,7 +66,7 @@ def test_resumed_training_ends_with_the_same_bits(new_run, monkeypatch):
         interrupt_at(patch, 3)
         with pytest.raises(TrainingInterrupted, match=r"iteration 3 of 6.*--resume"):
             go(ppo, stopped_run, CONFIG.iterations)
-    resumed = go(ppo, Run.open(stopped_run.folder, 3), CONFIG.iterations)
+    resumed = go(ppo, Run.open(stopped_run.folder, 3, CONFIG), CONFIG.iterations)
     chex.assert_trees_all_equal(straight, resumed)
 
     def numbers(run):

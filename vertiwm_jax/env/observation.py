@@ -21,8 +21,8 @@ _SPREAD = 1 + np.maximum(_STATIONS, 0) / 10
 _FAN = np.stack(
     [np.broadcast_to(_STATIONS[:, None], (11, 9)), _SPREAD[:, None] * _LANES], axis=-1
 ).astype(np.float32)
-_HEIGHT_POINTS = _FAN.reshape(-1, 2)
-_CLASS_POINTS = _FAN[2::2, ::4].reshape(-1, 2)
+_POINTS = _FAN.reshape(-1, 2)
+_CLASSES = np.arange(99).reshape(11, 9)[2::2, ::4].ravel()  # of the points
 
 _ANGLE_SCALE = 0.5  # rad
 _SPEED_SCALE = 5.0  # m/s
@@ -32,7 +32,7 @@ _SINKAGE_SCALE = 0.1  # m
 
 GOAL = slice(8, 11)
 """Where the observation holds the distance over 50 m and the cosine and sine of the bearing."""
-OBSERVATION_SIZE = 13 + len(_HEIGHT_POINTS) + 2 * len(_CLASS_POINTS)
+OBSERVATION_SIZE = 13 + 3 * len(_POINTS) + 2 * len(_CLASSES)
 OBSERVATION_LIMIT = 10.0
 """Every entry is clipped to this size."""
 
@@ -62,8 +62,9 @@ def observe(
     """`[OBSERVATION_SIZE]` float32 seen by one vehicle on the selected world.
 
     In order: roll, pitch; v_body; omega_body; distance to the goal, cosine and sine of its
-    bearing; the last action; heights of ground and obstacles relative to the vehicle on a fan
-    that reaches 21 m ahead; friction and plate sinkage on a coarser fan, -1 off the map.
+    bearing; the last action; on a fan of points that reaches 21 m ahead, heights of ground and
+    obstacles relative to the vehicle, slopes of the ground ahead and to the left; on a coarser
+    fan friction and plate sinkage, -1 off the map.
 
     goal: `[3]` m; action: `[2]` in [-1, 1].
     """
@@ -80,22 +81,20 @@ def observe(
         action,
     )
 
-    def at(points: np.ndarray) -> jax.Array:
-        # Written out: a matmul may round map coordinates to ten bits on an accelerator.
-        x, y = points[:, 0], points[:, 1]
-        return state.position[:2] + jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-
-    xy = at(_HEIGHT_POINTS)
-    heights = query.height(terrain, xy) + obstacles.height_above_ground(terrain, xy)
-
-    xy = at(_CLASS_POINTS)
+    # Written out: a matmul may round map coordinates to ten bits on an accelerator.
+    x, y = _POINTS[:, 0], _POINTS[:, 1]
+    xy = state.position[:2] + jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
     ground = query.surface(terrain, xy)
-    sinkage = plate_sinkage(terrain)[ground.semantic] / _SINKAGE_SCALE
-    features = jnp.stack([ground.friction, sinkage], axis=-1)
-    on_map = edge_distance(terrain, xy) >= 0
-    features = jnp.where(on_map[:, None], features, -1.0)
+    heights = ground.height + obstacles.height_above_ground(terrain, xy) - state.position[2]
+    # Slopes too: far away they are small differences of large heights, which a network that is
+    # fed normalised heights alone is slow to make out.
+    slope_x, slope_y = ground.gradient[:, 0], ground.gradient[:, 1]
+    ahead, left = cos * slope_x + sin * slope_y, cos * slope_y - sin * slope_x
 
-    observation = jnp.concatenate(
-        [*motion, (heights - state.position[2]) / _HEIGHT_SCALE, features.ravel()]
-    )
+    sinkage = plate_sinkage(terrain)[ground.semantic[_CLASSES]] / _SINKAGE_SCALE
+    classes = jnp.stack([ground.friction[_CLASSES], sinkage], axis=-1)
+    on_map = edge_distance(terrain, xy[_CLASSES]) >= 0
+    classes = jnp.where(on_map[:, None], classes, -1.0)
+
+    observation = jnp.concatenate([*motion, heights / _HEIGHT_SCALE, ahead, left, classes.ravel()])
     return jnp.clip(observation, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)

@@ -9,10 +9,14 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax.env.termination import edge_distance
+from vertiwm_jax.geometry import wrap
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.state import VehicleState
-from vertiwm_jax.terrain import obstacles
+from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
+
+_SURROUNDINGS = 4.0  # m
+_SWAYS = 13  # places that a pair of the circle may turn to
 
 
 @struct.dataclass
@@ -53,7 +57,8 @@ class RandomTaskConfig:
 
     distance: m, least and most from start to goal.
     heading_error: rad, the start looks at most this far off the goal.
-    steepest_start: rad, of the ground under the wheels.
+    steepest_start: rad, of the ground under the wheels; roughest_start: rad, root mean square
+        slope within 4 m.
     clearance: m that start and goal keep from obstacles and `margin` m from the map's edge.
     candidates: drawn for each task; the first acceptable one is taken.
     """
@@ -61,16 +66,21 @@ class RandomTaskConfig:
     distance: tuple[float, float] = (20.0, 115.0)
     heading_error: float = math.pi / 3
     steepest_start: float = math.radians(20)
+    roughest_start: float = math.radians(20)
     clearance: float = 1.0
     margin: float = 4.0
     candidates: int = 128
 
 
-def circle_tasks(terrain: TerrainMap, radius: float = 60.0, pairs: int = 10) -> Tasks:
+def circle_tasks(
+    terrain: TerrainMap, radius: float = 60.0, pairs: int = 10, sway: float = 0.0
+) -> Tasks:
     """Verti-Bench's geometry: W x `pairs` tasks across a circle, world after world.
 
     Starts are evenly spaced on a circle about the middle of the map, each goal lies opposite,
-    and the vehicle looks at it. `ValueError` if the circle does not fit on the map.
+    and the vehicle looks at it. With `sway`, each pair turns up to that many rad about the circle
+    to where the ground at the start is most level: on rough ground a vehicle often cannot leave
+    a start that was not looked at. `ValueError` if the circle does not fit on the map.
     """
     rows, columns = terrain.elevation.shape[-2:]
     half = np.array([columns - 1, rows - 1]) * float(terrain.resolution) / 2
@@ -79,16 +89,33 @@ def circle_tasks(terrain: TerrainMap, radius: float = 60.0, pairs: int = 10) -> 
             f"circle_tasks: radius {radius:g} m does not fit on a map of "
             f"{2 * half[0]:g} x {2 * half[1]:g} m; choose one below {half.min():g} m"
         )
-    middle = np.asarray(terrain.origin) + half * [1, -1]
-    angle = 2 * np.pi * np.arange(pairs) / pairs
-    offset = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    worlds = terrain.worlds
+    middle = jnp.asarray(terrain.origin + half * np.array([1, -1]), jnp.float32)
+    evenly = 2 * jnp.pi * jnp.arange(pairs) / pairs
+    turns = evenly[:, None] + sway * jnp.linspace(-1, 1, _SWAYS if sway else 1)
+
+    def on_circle(angle: jax.Array) -> jax.Array:
+        return middle + radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+
+    def most_level(world: jax.Array) -> jax.Array:
+        slopes = slope_around(terrain.select(world), on_circle(turns))
+        return jnp.take_along_axis(turns, jnp.argmin(slopes, axis=1)[:, None], axis=1)[:, 0]
+
+    world = jnp.arange(terrain.worlds, dtype=jnp.int32)
+    angle = jax.vmap(most_level)(world).ravel() if sway else jnp.tile(evenly, terrain.worlds)
     return Tasks(
-        world=jnp.repeat(jnp.arange(worlds, dtype=jnp.int32), pairs),
-        start=jnp.asarray(np.tile(middle + offset, (worlds, 1)), jnp.float32),
-        yaw=jnp.asarray(np.tile(angle - np.pi, worlds), jnp.float32),
-        goal=jnp.asarray(np.tile(middle - offset, (worlds, 1)), jnp.float32),
+        world=jnp.repeat(world, pairs),
+        start=on_circle(angle),
+        yaw=wrap(angle + jnp.pi),
+        goal=on_circle(angle + jnp.pi),
     )
+
+
+def slope_around(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
+    """Root mean square slope `[...]`, rad, of the ground within 4 m of points `[..., 2]`."""
+    side = jnp.linspace(-_SURROUNDINGS, _SURROUNDINGS, 7)
+    grid = jnp.stack(jnp.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    gradient = query.surface(terrain, xy[..., None, :] + grid).gradient
+    return jnp.arctan(jnp.sqrt(jnp.mean(jnp.sum(gradient**2, axis=-1), axis=-1)))
 
 
 def random_tasks(
@@ -148,6 +175,7 @@ def _draw(
             (distance >= config.distance[0])
             & (distance <= config.distance[1])
             & (tilt <= config.steepest_start)
+            & (slope_around(selected, start) <= config.roughest_start)
             & ~blocked(start)
             & ~blocked(goal)
         )

@@ -6,7 +6,16 @@ from flax import struct
 
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.observation import GOAL
+from vertiwm_jax.evaluation.navigation import Policy
 from vertiwm_jax.state import Command
+
+REFERENCE = "straight to goal"
+"""The baseline whose failures tell which tasks are hard."""
+
+
+def baselines(config: NavigationConfig) -> dict[str, Policy]:
+    """The policies of this file, by the names of their rows in a table."""
+    return {REFERENCE: StraightToGoal(config), "random": RandomActions()}
 
 
 @struct.dataclass
@@ -21,8 +30,8 @@ class StraightToGoal:
     speed: float = 4.0
     gain: float = 1.0
 
-    def __call__(self, observation: jax.Array, key: jax.Array) -> jax.Array:
-        """`[..., O]` observation to `[..., 2]` action."""
+    def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
+        """`[..., O]` observation to `[..., 2]` action; the key is not used."""
         _, cos, sin = jnp.moveaxis(observation[..., GOAL], -1, 0)
         steering = self.gain * jnp.arctan2(sin, cos)
         return self.config.action(Command(jnp.full_like(steering, self.speed), steering))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vertiwm_jax import runs
 from vertiwm_jax.env import picture
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -102,6 +105,14 @@ def learning_curves(
             handles = panels.flat[0].get_legend_handles_labels()
             figure.legend(*handles, loc="outside upper center", ncols=4)
     return figure
+
+
+def save(figure: Figure, path: str | Path) -> None:
+    """Write a figure as a whole or not at all, in the format of the ending; else `RunError`."""
+    image = io.BytesIO()
+    with _style():
+        figure.savefig(image, format=Path(path).suffix[1:])
+    runs.write_atomic(path, image.getvalue())
 
 
 def _line(i: int) -> tuple[str, str]:

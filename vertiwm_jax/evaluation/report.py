@@ -7,9 +7,26 @@ from typing import Any
 import jax
 import numpy as np
 
-from vertiwm_jax.evaluation.navigation import NavigationResult, Summary, format_table
+from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
+from vertiwm_jax.evaluation.navigation import (
+    NavigationResult,
+    Policy,
+    Summary,
+    evaluate,
+    format_table,
+)
+from vertiwm_jax.rl import ground
 
 Results = Mapping[str, NavigationResult]
+
+
+def drive(
+    env: NavigationEnv, params: NavigationParams, policies: Mapping[str, Policy], key: jax.Array
+) -> dict[str, Results]:
+    """Drives all tasks of the pool with each policy; the results by difficulty of the ground."""
+    print(f"driving {params.pool_size} tasks on {params.terrain.worlds} worlds ...", flush=True)
+    results = {name: evaluate(env, params, policy, key) for name, policy in policies.items()}
+    return by_difficulty(results, ground.difficulties(params.terrain))
 
 
 def by_difficulty(results: Results, difficulty: Sequence[str]) -> dict[str, Results]:
@@ -50,11 +67,12 @@ def _plain(row: Summary) -> dict[str, Any]:
 
 def _section(name: str, results: Results, reference: str) -> str:
     table = format_table({policy: Summary.of(result) for policy, result in results.items()})
+    others = [policy for policy in results if policy != reference]
+    if not others:
+        return f"**{name}**\n\n{table}"
     failures = int(np.sum(~np.asarray(results[reference].success)))
     rescued = ", ".join(
-        f"{policy} {_rescued(result, results[reference])}"
-        for policy, result in results.items()
-        if policy != reference
+        f"{policy} {_rescued(results[policy], results[reference])}" for policy in others
     )
     return (
         f"**{name}**\n\n{table}\n\nSolved of the {failures} tasks that {reference} fails: {rescued}"

@@ -87,6 +87,7 @@ def load(folder: str | Path, split: Split) -> tuple[Drives, TerrainMap]:
         picked = {name: array[chosen] for name, array in arrays.items()}
         parts.append({**picked, "world": np.full(len(chosen), world, np.int32)})
         maps.append(files.load(_find_map(folder, path, map_name)))
+        _check_classes(path, arrays["wheel_class"], len(maps[-1].class_names))
     steps = {part["control"].shape[1] for part in parts}
     if len(steps) > 1:
         raise DataError(f"{folder}: expected files of equally long drives, found {sorted(steps)}")
@@ -138,18 +139,22 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], str]:
                 raise DataError(f"{path}: missing {', '.join(missing)}; found {archive.files}")
             arrays = {name: archive[name] for name in _SHAPES}
             meta = str(archive["meta"])
-    except (OSError, zipfile.BadZipFile, ValueError) as error:
+    except (OSError, EOFError, zipfile.BadZipFile, ValueError) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(f"{path}: expected an .npz archive of plain arrays: {error}") from error
     _check_shapes(path, arrays)
     _check_values(path, arrays)
     try:
-        return arrays, json.loads(meta)["map"]
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        map_name = json.loads(meta)["map"]
+    except (json.JSONDecodeError, KeyError, TypeError):
+        map_name = None
+    if not isinstance(map_name, str):
         raise DataError(
-            f'{path}: meta: expected JSON with "map", the file name of the terrain map'
-        ) from error
+            f'{path}: meta: expected JSON with "map", the file name of the terrain map; '
+            f"found {meta[:80]}"
+        )
+    return arrays, map_name
 
 
 _SHAPES = {
@@ -172,6 +177,11 @@ def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
                 f"{path}: {name}: expected shape {list(wanted)} (K and T as in control), "
                 f"found {list(arrays[name].shape)}"
             )
+    if not control[0]:
+        raise DataError(f"{path}: control: expected one drive or more, found shape {list(control)}")
+    for name in ("state", "control"):
+        if arrays[name].dtype.kind not in "fiu":
+            raise DataError(f"{path}: {name}: expected numbers, found dtype {arrays[name].dtype}")
 
 
 def _check_values(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -196,6 +206,15 @@ def _check_values(path: Path, arrays: dict[str, np.ndarray]) -> None:
                 f"{path}: {name}: expected finite {meaning} within {limit:.4g}, "
                 f"found {values[bad][0]:.4g} among {bad.sum()} such values"
             )
+
+
+def _check_classes(path: Path, wheel_class: np.ndarray, classes: int) -> None:
+    integers = np.issubdtype(wheel_class.dtype, np.integer)
+    if not integers or wheel_class.min() < 0 or wheel_class.max() >= classes:
+        raise DataError(
+            f"{path}: wheel_class: expected class ids 0 to {classes - 1} of its map, found "
+            f"{wheel_class.dtype} from {wheel_class.min()} to {wheel_class.max()}"
+        )
 
 
 def _find_map(folder: Path, path: Path, name: str) -> Path:

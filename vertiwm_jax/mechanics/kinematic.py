@@ -77,18 +77,19 @@ class KinematicBicycle:
     ) -> tuple[VehicleState, tuple[()]]:
         decay = jnp.exp(-STEP_SECONDS / params.speed_lag)
         speed = command.speed + (state.velocity[0] - command.speed) * decay
-        # The body origin is halfway between the axles, so it slips by half the steering.
+        # The rear axle does not slip; the body origin, halfway between the axles, does.
+        yaw_rate = speed * jnp.tan(command.steering) / params.wheelbase
+        sideways = 0.5 * params.wheelbase * yaw_rate
         side_slip = jnp.arctan(0.5 * jnp.tan(command.steering))
-        yaw_rate = speed * 2.0 * jnp.sin(side_slip) / params.wheelbase
         course = state.rpy[2] + 0.5 * STEP_SECONDS * yaw_rate + side_slip
         # Speed is along the slope; its plan view is shorter.
-        level = jnp.cos(state.rpy[1]) * STEP_SECONDS * speed
+        level = jnp.cos(state.rpy[1]) * STEP_SECONDS * speed / jnp.cos(side_slip)
         xy = state.position[:2] + level * jnp.stack([jnp.cos(course), jnp.sin(course)])
         yaw = geometry.wrap(state.rpy[2] + STEP_SECONDS * yaw_rate)
         position, rpy = rest_on_ground(
             terrain, xy, yaw, params.wheelbase, params.track, params.ride_height
         )
-        velocity = speed * jnp.stack([jnp.cos(side_slip), jnp.sin(side_slip), 0.0 * speed])
+        velocity = jnp.stack([speed, sideways, 0.0 * speed])
         tilt_rate = geometry.wrap(rpy - state.rpy)[:2] / STEP_SECONDS
         angular_velocity = jnp.concatenate([tilt_rate, yaw_rate[None]])
         return VehicleState(position, rpy, velocity, angular_velocity), ()

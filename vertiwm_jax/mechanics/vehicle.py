@@ -114,3 +114,34 @@ def hmmwv() -> Vehicle:
         length=4.6,
         width=2.1,
     )
+
+
+def rover() -> Vehicle:
+    """A 1/10-scale crawler of the Verti-4-Wheeler's kind (Datar et al. 2024): 0.31 m wheelbase.
+
+    Nominal figures for a 3.5 kg rover with stiff tyres; measure your own before relying on them.
+    """
+    return _vehicle(
+        mass=3.5,
+        centre_of_mass=(0.0, 0.0, 0.02),
+        inertia=(0.02, 0.045, 0.055),
+        wheel_position=_corners(0.156, 0.10),
+        wheel_radius=0.055,
+        wheel_width=0.045,
+        wheel_inertia=4e-4,
+        wheel_weight=1.5,
+        spring=(570.0, 570.0, 570.0, 570.0),
+        damper=(20.0, 20.0, 20.0, 20.0),
+        free_travel=(-0.0125, -0.0125, -0.0125, -0.0125),
+        steering_limit=0.5,
+        steering_rate=6.0,
+        speed_gain=4.0,
+        wheel_torque=0.9,
+        wheel_power=12.0,
+        wheel_speed_limit=80.0,
+        brake_torque=0.9,
+        tyre_friction=0.9,
+        hull=_hull(0.12, 0.05, 0.0, 0.12),
+        length=0.43,
+        width=0.25,
+    )

@@ -30,6 +30,8 @@ class GroundConfig:
     """Random tasks to train on, beside those across the circle of every world."""
     pairs: int = 10
     """Tasks across the circle of a world."""
+    sway: float = 0.25
+    """How far, rad, each of them may turn to a more level start; 0 is Verti-Bench's circle."""
 
 
 def grounds(
@@ -37,8 +39,7 @@ def grounds(
 ) -> tuple[TerrainMap, TerrainMap]:
     """The worlds to train on and those held out, from maps at `path` or else procedural.
 
-    path: a Verti-Bench checkout, a folder of `.npz` maps. Too few maps to hold any out raise
-    `ValueError`, bad ones `MapError`.
+    path: see `load`. Too few maps to hold any out raise `ValueError`.
     """
     if path is None:
         train, held_out = (
@@ -48,7 +49,7 @@ def grounds(
             )
         )
         return train, held_out
-    terrain = vertibench.load(path) if (path / "envs").is_dir() else files.load(path)
+    terrain = load(path)
     if terrain.worlds < config.held_out_every:
         raise ValueError(
             f"{path}: held_out_every: expected at most the {terrain.worlds} worlds found, "
@@ -57,6 +58,11 @@ def grounds(
     number = np.arange(terrain.worlds)
     held_out = number % config.held_out_every == config.held_out_every - 1
     return _subset(terrain, ~held_out), _subset(terrain, held_out)
+
+
+def load(path: Path) -> TerrainMap:
+    """The maps of a Verti-Bench checkout or of a folder of `.npz` maps; else `MapError`."""
+    return vertibench.load(path) if (path / "envs").is_dir() else files.load(path)
 
 
 def training_tasks(
@@ -71,7 +77,9 @@ def test_tasks(config: GroundConfig, terrain: TerrainMap) -> Tasks:
     """Tasks across the circle of every world, 60 m in radius where the map is large enough."""
     cells = min(terrain.elevation.shape[-2:]) - 1
     half = cells * float(terrain.resolution) / 2
-    return circle_tasks(terrain, min(worlds.START_RADIUS, 15 / 16 * half), config.pairs)
+    return circle_tasks(
+        terrain, min(worlds.START_RADIUS, 15 / 16 * half), config.pairs, config.sway
+    )
 
 
 def difficulties(terrain: TerrainMap) -> list[str]:

@@ -92,6 +92,8 @@ def train(
     else:
         init = jax.jit(jax.vmap(algorithm.init, (None, 0)))
         done, state = 0, init(env_params, jax.random.split(key, config.seeds))
+        # Placed as a restored state is, so that both run the same program.
+        state = jax.device_put(state, jax.devices()[0])
     if done >= iterations:
         return state
 

@@ -19,7 +19,7 @@ from gymnax.environments.environment import Environment
 
 from vertiwm_jax.networks.policy import Actor, Critic, Gaussian
 from vertiwm_jax.rl.advantages import discounted_returns, generalised_advantages
-from vertiwm_jax.rl.learned import MeanAction
+from vertiwm_jax.rl.learned import Controller, MeanAction
 from vertiwm_jax.rl.normalise import RunningStatistics
 
 Params = Any
@@ -170,11 +170,14 @@ class PPO:
     env: static; its parameters are an argument of every function.
     outcomes: what to report of an episode, from the `info` of its last step: named scalars,
         which are averaged over the episodes that end in an iteration.
+    base: a controller `(observation, key) -> action` in [-1, 1] whose action the policy corrects:
+        learning starts from what it can do (Silver et al., 2018, "Residual policy learning").
     """
 
     env: Environment
     config: PPOConfig
     outcomes: Callable[[dict[str, jax.Array]], Metrics] = lambda info: {}
+    base: Controller | None = None
 
     def init(self, env_params: Params, key: jax.Array) -> TrainState:
         """The state before the first iteration."""
@@ -240,7 +243,8 @@ class PPO:
 
     def policy(self, env_params: Params, state: TrainState) -> MeanAction:
         """What `state` has learned."""
-        return MeanAction(self._actor(env_params), state.params["actor"], state.observations)
+        actor, params = self._actor(env_params), state.params["actor"]
+        return MeanAction(actor, params, state.observations, self.base)
 
     def value(self, state: TrainState, observation: jax.Array) -> jax.Array:
         """`[..., O]` observations to `[...]` values, in units of reward."""
@@ -280,7 +284,8 @@ class PPO:
             seen = state.observations.normalise(environments.observation)
             policy = cast(Gaussian, actor.apply(state.params["actor"], seen))
             action = policy.sample(action_key)
-            bounded = low + (high - low) * (jnp.clip(action, -1, 1) + 1) / 2
+            base = self.base(environments.observation, action_key) if self.base else 0.0
+            bounded = low + (high - low) * (jnp.clip(base + action, -1, 1) + 1) / 2
             step_keys = jax.random.split(step_key, self.config.num_envs)
             observation, env_state, reward, terminated, truncated, info = step(
                 step_keys, environments.state, bounded, env_params

@@ -1,0 +1,78 @@
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.evaluation import report
+from vertiwm_jax.evaluation.navigation import NavigationResult
+
+DIFFICULTY = ["high", "low", "high"]
+WORLD = [0, 0, 1, 1, 2, 2]
+
+
+def result(reached: list[int]) -> NavigationResult:
+    """Two episodes on each of three worlds, of 10, 20, ... steps; `reached` are 0 or 1."""
+    ending = jnp.where(jnp.asarray(reached) == 1, int(Ending.GOAL), int(Ending.STUCK))
+    steps = 10 * (1 + jnp.arange(6))
+    zeros, points = jnp.zeros(6), jnp.zeros((6, 61, 3))
+    return NavigationResult(
+        ending=ending,
+        steps=steps,
+        abs_roll=zeros,
+        abs_pitch=zeros,
+        driven=steps * 0.5,
+        final_distance=zeros,
+        world=jnp.asarray(WORLD),
+        goal=jnp.zeros((6, 3)),
+        position=points,
+        rpy=points,
+    )
+
+
+@pytest.fixture(scope="module")
+def groups():
+    results = {
+        "learned": result([1, 1, 1, 0, 1, 0]),
+        "straight": result([0, 1, 1, 1, 0, 0]),
+        "random": result([0, 0, 0, 0, 0, 0]),
+    }
+    return report.by_difficulty(results, DIFFICULTY)
+
+
+def test_episodes_go_to_the_difficulty_of_their_world(groups):
+    assert list(groups) == ["high", "low"]
+    for name, worlds in (("high", [0, 0, 2, 2]), ("low", [1, 1])):
+        for episodes in groups[name].values():
+            assert episodes.world.tolist() == worlds
+            assert {len(leaf) for leaf in jax.tree.leaves(episodes)} == {len(worlds)}
+    assert groups["high"]["learned"].steps.tolist() == [10, 20, 50, 60]
+
+
+def test_summary_is_json_and_counts_rescues(groups):
+    summary = json.loads(json.dumps(report.summary(groups, "straight"), allow_nan=False))
+    high, low = summary["high"], summary["low"]
+    assert (high["learned"]["successes"], high["straight"]["successes"]) == (3, 1)
+    # Of the tasks 0, 4 and 5 that the reference fails, the learned policy solves 0 and 4.
+    assert high["learned"]["solved_of_reference_failures"] == 2
+    assert low["learned"]["solved_of_reference_failures"] == 0
+    assert low["straight"]["solved_of_reference_failures"] == 0
+    assert high["learned"]["seconds"] == pytest.approx(np.mean([1, 2, 5]), rel=1e-5)
+    assert high["random"]["seconds"] is None
+    assert high["random"]["endings"] == {"stuck": 4}
+
+
+def test_markdown_has_a_table_for_each_difficulty(groups):
+    text = report.markdown(groups, "straight")
+    assert text.index("**high**") < text.index("**low**")
+    assert "Solved of the 3 tasks that straight fails: learned 2, random 0" in text
+    assert "Solved of the 0 tasks that straight fails: learned 0, random 0" in text
+    rows = [line for line in text.splitlines() if line.startswith("| learned ")]
+    assert [row.split("|")[2].strip() for row in rows] == ["3/4", "1/2"]
+
+
+def test_the_reference_alone_is_compared_with_nothing(groups):
+    text = report.markdown({"low": {"straight": groups["low"]["straight"]}}, "straight")
+    assert "| straight " in text and "Solved" not in text

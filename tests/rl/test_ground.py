@@ -1,0 +1,79 @@
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from vertiwm_jax.env.tasks import Chassis
+from vertiwm_jax.rl import ground
+from vertiwm_jax.rl.ground import GroundConfig
+from vertiwm_jax.rl.task import TaskConfig
+from vertiwm_jax.terrain import files
+from vertiwm_jax.terrain import map as terrain_map
+
+GRASS = 3
+CONFIG = GroundConfig(train_worlds=3, held_out_worlds=3, starts=6, pairs=4)
+
+
+def plane(slope_deg: float, size: int = 17) -> terrain_map.TerrainMap:
+    """A plane that rises eastwards."""
+    rise = np.tan(np.radians(slope_deg)) * np.arange(float(size))
+    return terrain_map.build(np.broadcast_to(rise, (size, size)), np.full((2, 2), GRASS))
+
+
+@pytest.fixture(scope="module")
+def procedural():
+    return ground.grounds(CONFIG, None, jax.random.key(0))
+
+
+def test_procedural_worlds_are_never_both_trained_and_tested_on(procedural):
+    train, held_out = (np.asarray(terrain.elevation) for terrain in procedural)
+    assert train.shape == held_out.shape == (3, 129, 129)
+    assert not any(np.allclose(a, b) for a in train for b in held_out)
+
+
+def test_procedural_worlds_have_the_difficulty_they_were_drawn_with(procedural):
+    for terrain in procedural:
+        assert ground.difficulties(terrain) == ["low", "mid", "high"]
+
+
+def test_every_so_manieth_map_is_held_out(tmp_path):
+    slopes = np.arange(7.0)
+    for i, slope in enumerate(slopes):
+        files.save(plane(slope), tmp_path / f"{i}.npz")
+    config = replace(CONFIG, held_out_every=3)
+    train, held_out = ground.grounds(config, tmp_path, jax.random.key(0))
+
+    def found(terrain):
+        rise = np.asarray(terrain.elevation[:, 0, 1] - terrain.elevation[:, 0, 0])
+        return np.degrees(np.arctan(rise)).round(2).tolist()
+
+    assert found(held_out) == [2, 5] and found(train) == [0, 1, 3, 4, 6]
+    assert train.semantic.shape[0] == train.friction.shape[0] == train.obstacles.shape[0] == 5
+    with pytest.raises(ValueError, match="expected at most the 7 worlds found, is 8"):
+        ground.grounds(replace(config, held_out_every=8), tmp_path, jax.random.key(0))
+
+
+def test_difficulty_is_the_nearest_preset():
+    terrain = terrain_map.stack([plane(slope) for slope in (0, 8.5, 8.6, 18.5, 40)])
+    assert ground.difficulties(terrain) == ["low", "low", "mid", "high", "extreme"]
+
+
+def test_tasks_cross_every_world_and_start_anywhere(procedural):
+    train, held_out = procedural
+    across = ground.test_tasks(CONFIG, held_out)
+    assert np.bincount(np.asarray(across.world)).tolist() == [4, 4, 4]
+    np.testing.assert_allclose(np.linalg.norm(across.start, axis=-1), 60, rtol=1e-5)
+    np.testing.assert_allclose(across.goal, -np.asarray(across.start), atol=1e-3)
+    tasks = ground.training_tasks(CONFIG, train, Chassis(), jax.random.key(1))
+    assert tasks.start.shape == (6 + 3 * 4, 2)
+    assert (np.abs(np.asarray(tasks.start)) < 64).all()
+    small = ground.test_tasks(CONFIG, plane(0))
+    np.testing.assert_allclose(np.linalg.norm(small.start, axis=-1), 7.5, rtol=1e-5)
+
+
+def test_every_purpose_has_its_own_randomness():
+    config = TaskConfig(seed=3)
+    keys = [config.key(name) for name in ("worlds", "tasks", "training", "testing")]
+    drawn = {int(jax.random.bits(part)) for key in keys for part in (key, *jax.random.split(key))}
+    assert len(drawn) == 12

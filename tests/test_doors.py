@@ -1,0 +1,273 @@
+"""The commands from end to end, on settings so small that compiling is all their cost."""
+
+import json
+import os
+import shutil
+import signal
+
+import chex
+import jax
+import numpy as np
+import pytest
+
+from vertiwm_jax import config as configuration
+from vertiwm_jax import evaluate, ppo, runs
+from vertiwm_jax.ppo import TrainConfig
+from vertiwm_jax.rl import checkpoints, task
+from vertiwm_jax.runs import Run
+from vertiwm_jax.terrain import files
+from vertiwm_jax.terrain import map as terrain_map
+
+GRASS = 3
+TINY = """
+ground: {train_worlds: 2, held_out_worlds: 2, starts: 8, pairs: 2}
+navigation: {horizon_seconds: 3, settle_steps: 2}
+simulator: {substeps: 1}
+ppo:
+  {transitions: 256, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1, hidden: [8],
+   schedule: constant}
+loop: {checkpoint_every: 2}
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("doors")
+    (folder / "tiny.yaml").write_text(TINY)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def train(folder):
+    """Runs the door, with the tiny settings first; gives the newest run folder."""
+
+    def train(*argv):
+        # What one training has compiled, the next finds there.
+        common = ["--runs", str(folder / "runs"), "--compile-cache", str(folder / "compiled")]
+        first = [] if "--resume" in argv else ["--config", str(folder / "tiny.yaml"), *common]
+        ppo.main([*first, *argv])
+        return max((folder / "runs").iterdir(), key=lambda run: run.stat().st_ctime_ns)
+
+    yield train
+    jax.config.update("jax_compilation_cache_dir", None)
+
+
+@pytest.fixture(scope="module")
+def run(train):
+    """A finished training."""
+    return train()
+
+
+def refusal(door, *argv):
+    """The one line that a door ends in."""
+    with pytest.raises(SystemExit) as stop:
+        door([str(word) for word in argv])
+    message = stop.value.code
+    assert isinstance(message, str) and message.startswith("error: ") and "\n" not in message
+    return message
+
+
+def numbers(run):
+    timed = ("wall_time", "transitions_per_second")
+    lines = runs.read_metrics(run)
+    return [{name: line[name] for name in line if name not in timed} for line in lines]
+
+
+def learned(run):
+    config = configuration.load(TrainConfig, run / "config.yaml")
+    env, params = task.test_environment(config, task.held_out(config))
+    return ppo.learned(config, env, params, run)
+
+
+def test_a_run_leaves_all_that_was_promised(run, folder):
+    left = {path.name.split(".tfevents")[0] for path in run.iterdir()}
+    assert left >= {
+        "config.yaml", "metrics.jsonl", "events.out", "checkpoints", "learning_curves.png",
+        "summary.md", "summary.json",
+    }  # fmt: skip
+    lines = runs.read_metrics(run)
+    assert [line["step"] for line in lines] == [1, 2, 3, 4]
+    assert [line["transitions"] for line in lines] == [64, 128, 192, 256]
+    assert all(np.isfinite(line["policy_loss"]) for line in lines)
+    assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["2", "4"]
+    summary = json.loads((run / "summary.json").read_text())
+    for difficulty, rows in summary.items():
+        assert list(rows) == ["ppo", "straight to goal", "random"]
+        assert (run / f"trajectories_{difficulty}.png").is_file()
+        assert f"**{difficulty}**" in (run / "summary.md").read_text()
+    assert sum(rows["ppo"]["tasks"] for rows in summary.values()) == 4
+    asked = configuration.load(TrainConfig, folder / "tiny.yaml")
+    assert configuration.load(TrainConfig, run / "config.yaml").ppo == asked.ppo
+
+
+def test_resuming_is_as_if_never_stopped(run, train, monkeypatch):
+    log = Run.log
+
+    def stopping(self, step, metrics):
+        log(self, step, metrics)
+        if step == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as stop:
+        patch.setattr(Run, "log", stopping)
+        train()
+    assert stop.value.code == 130
+    stopped = max(run.parent.iterdir(), key=lambda folder: folder.name)
+    assert stopped != run and len(numbers(stopped)) == 3
+    train("--resume", str(stopped))
+    assert numbers(stopped) == numbers(run)
+    chex.assert_trees_all_equal(learned(stopped), learned(run))
+    assert (stopped / "summary.json").read_text() == (run / "summary.json").read_text()
+    assert (stopped / "config.yaml").read_text() == (run / "config.yaml").read_text()
+
+
+def test_what_is_set_beside_resume_is_kept(run, train, tmp_path):
+    again = shutil.copytree(run, tmp_path / "again")
+    before = (again / "config.yaml").read_text()
+    message = refusal(ppo.main, "--resume", again, "--ppo.hidden", 16)
+    assert "actor" in message and "16]" in message and "8]" in message
+    assert (again / "config.yaml").read_text() == before
+    train("--resume", str(again), "--ppo.transitions", "320")
+    assert [line["step"] for line in numbers(again)] == [1, 2, 3, 4, 5]
+    config = configuration.load(TrainConfig, again / "config.yaml")
+    assert config.ppo.transitions == 320 and config.resume is None
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("ppo: {learnin_rate: 1}", "ppo.learnin_rate: unknown key, expected one of"),
+        ("ppo: {epochs: many}", "ppo.epochs: expected int, found 'many' (str)"),
+        ("ppo: {minibatches: 7}", "ppo: minibatches: 7 does not divide"),
+        ("loop: {seeds: 0}", "loop: seeds: expected at least 1, found 0"),
+    ],
+)
+def test_bad_settings_are_named(tmp_path, capsys, text, words):
+    file = tmp_path / "bad.yaml"
+    file.write_text(text)
+    with pytest.raises(SystemExit) as stop:
+        ppo.main(["--config", str(file)])
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert f"error: {file}: {words}" in message and message.count("\n") == 1
+
+
+def test_bad_worlds_are_named(folder, tmp_path):
+    tiny = ("--config", folder / "tiny.yaml", "--runs", tmp_path / "runs")
+    assert "nowhere" in refusal(ppo.main, *tiny, "--worlds", tmp_path / "nowhere")
+    maps(tmp_path / "maps", count=2)
+    message = refusal(ppo.main, *tiny, "--worlds", tmp_path / "maps")
+    assert "held_out_every: expected at most the 2 worlds found" in message
+    (tmp_path / "maps" / "map_0.npz").write_bytes(b"no archive")
+    assert "map_0.npz" in refusal(ppo.main, *tiny, "--worlds", tmp_path / "maps")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_runs_that_cannot_be_are_named(run, folder, tmp_path):
+    (tmp_path / "file").touch()
+    tiny = ("--config", folder / "tiny.yaml")
+    message = refusal(ppo.main, *tiny, "--runs", tmp_path / "file")
+    assert "file: cannot start a run there" in message
+    damaged = shutil.copytree(run, tmp_path / "damaged")
+    (damaged / "metrics.jsonl").write_text("{broken\n")
+    assert "metrics.jsonl: line 1" in refusal(ppo.main, "--resume", damaged)
+
+
+def test_a_run_is_evaluated_as_at_its_end(run, tmp_path, capsys):
+    evaluate.main(["navigation", "--policy", str(run), "--json", str(tmp_path / "found.json")])
+    assert json.loads((tmp_path / "found.json").read_text()) == json.loads(
+        (run / "summary.json").read_text()
+    )
+    assert (run / "summary.md").read_text() in capsys.readouterr().out
+
+
+def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch):
+    navigate = ["navigation", "--policy"]
+    maps(tmp_path / "maps", count=2)
+    evaluate.main([*navigate, str(run), "--worlds", str(tmp_path / "maps")])
+    assert "driving 4 tasks on 2 worlds" in capsys.readouterr().out
+    # The usual worlds are many.
+    monkeypatch.setattr(configuration, "default_config", lambda name: run / "config.yaml")
+    evaluate.main([*navigate, "straight", "--difficulties", "extreme"])
+    text = capsys.readouterr().out
+    assert "**extreme**" in text and "| straight to goal" in text
+    assert "random" not in text and "Solved of" not in text
+    evaluate.main([*navigate, "random"])
+    assert "| random" in capsys.readouterr().out
+
+
+def test_policies_that_are_none_are_named(run, tmp_path):
+    navigate = ("navigation", "--policy")
+    message = refusal(evaluate.main, *navigate, tmp_path / "none")
+    assert "none/config.yaml: no such file" in message
+    shutil.copy(run / "config.yaml", tmp_path)
+    message = refusal(evaluate.main, *navigate, tmp_path)
+    assert message.endswith("expected checkpoints of a training, found none")
+    text = (run / "config.yaml").read_text().replace("hidden: [8]", "hidden: [4]")
+    (tmp_path / "config.yaml").write_text(text)
+    shutil.copytree(run / "checkpoints", tmp_path / "checkpoints")
+    assert "belongs to another configuration" in refusal(evaluate.main, *navigate, tmp_path)
+    newest = checkpoints.latest(run / "checkpoints")
+    assert newest is not None and newest.name in ("4", "5")
+
+
+def test_predictions_of_drives(tmp_path, capsys):
+    drives(tmp_path, count=25, steps=24, speed=4.0)
+    argv = ["prediction", "--data", str(tmp_path), "--context", "2", "--horizon", "4"]
+    evaluate.main([*argv, "--json", str(tmp_path / "found.json")])
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert list(found) == ["builtin", "kinematic bicycle", "constant velocity"]
+    # Three drives of the test split, two windows each, straight on at constant speed.
+    assert all(row["count"] == {"rigid": 6} for row in found.values())
+    assert found["constant velocity"]["mean"]["rigid"] < 1e-4
+    assert found["builtin"]["mean"]["rigid"] < 0.1
+    assert "| constant velocity | 0.000 (0.000-0.000) | 0 |" in capsys.readouterr().out
+
+
+def test_bad_drives_are_named(tmp_path, capsys):
+    predict = ("prediction", "--data", tmp_path)
+    assert "found none" in refusal(evaluate.main, *predict)
+    drives(tmp_path, count=25, steps=24, speed=4.0)
+    assert "at least 32 steps, found at most 24" in refusal(evaluate.main, *predict)
+    drives(tmp_path, count=3, steps=24, speed=4.0)
+    assert "for the test split" in refusal(evaluate.main, *predict)
+    drives(tmp_path, count=25, steps=24, speed=4000.0)
+    assert "drives.npz: state: expected" in refusal(evaluate.main, *predict)
+    (tmp_path / "maps" / "map_0.npz").unlink()
+    drives(tmp_path, count=25, steps=24, speed=4.0, with_map=False)
+    assert "map_0.npz was expected" in refusal(evaluate.main, *predict)
+    for argv in (["prediction"], ["predict"], ["prediction", "--data", ".", "--stride", "0"]):
+        with pytest.raises(SystemExit) as stop:
+            evaluate.main(argv)
+        assert stop.value.code == 2
+    assert "stride: expected at least 1, found 0" in capsys.readouterr().err
+
+
+def maps(folder, count):
+    """Worlds of grass as procedural ones are in size, with a slope of their own each."""
+    folder.mkdir()
+    for i in range(count):
+        elevation = np.broadcast_to(0.05 * i * np.arange(129.0), (129, 129))
+        terrain = terrain_map.build(elevation, np.full((16, 16), GRASS))
+        files.save(terrain, folder / f"map_{i}.npz")
+
+
+def drives(folder, count, steps, speed, with_map=True):
+    """Straight drives at constant speed over level grass, as recorded ones are stored."""
+    if with_map:
+        shutil.rmtree(folder / "maps", ignore_errors=True)
+        maps(folder / "maps", count=1)
+    state = np.zeros((count, steps + 1, 12), np.float32)
+    state[..., 0] = 0.1 * speed * np.arange(steps + 1)
+    state[..., 2] = 0.45
+    state[..., 6] = speed
+    control = np.zeros((count, steps, 2), np.float32)
+    control[..., 0] = speed
+    np.savez(
+        folder / "drives.npz",
+        state=state,
+        control=control,
+        length=np.full(count, steps),
+        wheel_class=np.full((count, steps + 1, 4), GRASS, np.uint8),
+        meta=json.dumps({"map": "map_0.npz"}),
+    )
