@@ -5,7 +5,8 @@ import pytest
 from env.worlds import ground, hills, task
 
 from vertiwm_jax.env import tasks
-from vertiwm_jax.env.tasks import Chassis, RandomTaskConfig
+from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env.tasks import RandomTaskConfig
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import obstacles

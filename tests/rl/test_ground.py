@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from vertiwm_jax.env.tasks import Chassis
+from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.rl import ground
 from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.rl.task import TaskConfig

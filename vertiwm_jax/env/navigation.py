@@ -12,8 +12,9 @@ from gymnax.environments import environment, spaces
 
 from vertiwm_jax.dynamics import Dynamics, History, Params
 from vertiwm_jax.env import observation, tasks
+from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.reward import RewardConfig, reward
-from vertiwm_jax.env.tasks import Chassis, Tasks
+from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending, edge_distance, first_ending, is_terminal
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import obstacles, query
@@ -223,7 +224,9 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         """`[O]` float32, see `observation.observe`."""
         del key, action
         terrain = params.terrain.select(state.world)
-        return observation.observe(terrain, state.vehicle, state.goal, state.action)
+        return observation.observe(
+            terrain, self.config.chassis, state.vehicle, state.goal, state.action
+        )
 
     def is_terminated(self, state: NavigationState, params: NavigationParams) -> jax.Array:
         """Whether the task itself is over."""
@@ -312,6 +315,6 @@ def _settle(
             stalled=zero,
             ending=zero,
         )
-        return state, observation.observe(selected, vehicle, goal, action)
+        return state, observation.observe(selected, env.config.chassis, vehicle, goal, action)
 
     return jax.vmap(settle)(pool)

@@ -8,31 +8,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
 
-# A fan of points in the yaw frame (x forward, y left, m): dense near the wheels, where tilt is
-# decided, and wider and coarser with distance, where the way round a hill is.
-_STATIONS = np.array([-3.0, -1.5, 0.0, 1.5, 3.0, 4.5, 6.5, 9.0, 12.0, 16.0, 21.0])
-_LANES = 1.1 * np.arange(-4, 5)
-_SPREAD = 1 + np.maximum(_STATIONS, 0) / 10
-_FAN = np.stack(
-    [np.broadcast_to(_STATIONS[:, None], (11, 9)), _SPREAD[:, None] * _LANES], axis=-1
-).astype(np.float32)
-_POINTS = _FAN.reshape(-1, 2)
-_CLASSES = np.arange(99).reshape(11, 9)[2::2, ::4].ravel()  # of the points
+# Where the vehicle would stand on arcs of constant steering: as far as a choice made now reaches.
+_STEERING = np.linspace(-1.0, 1.0, 9)  # of the front wheels' largest angle
+_STATIONS = np.array([0.45, 0.9, 1.4, 2.0, 2.7, 3.5, 4.5, 6.0])  # wheelbases along an arc
+_LARGEST_STEERING = 0.37  # rad
+_POSES = 1 + _STEERING.size * _STATIONS.size  # the first is where it stands now
+_CLASSES = 1 + np.arange(_STEERING.size * _STATIONS.size).reshape(9, 8)[::4, ::2].ravel()
 
 _ANGLE_SCALE = 0.5  # rad
 _SPEED_SCALE = 5.0  # m/s
 _DISTANCE_SCALE = 50.0  # m
 _HEIGHT_SCALE = 2.0  # m
+_SLOPE_SCALE = 0.4
+_TWIST_SCALE = 0.2
 _SINKAGE_SCALE = 0.1  # m
 
 GOAL = slice(8, 11)
 """Where the observation holds the distance over 50 m and the cosine and sine of the bearing."""
-OBSERVATION_SIZE = 13 + 3 * len(_POINTS) + 2 * len(_CLASSES)
+OBSERVATION_SIZE = 13 + 4 * _POSES + 2 * _CLASSES.size
 OBSERVATION_LIMIT = 10.0
 """Every entry is clipped to this size."""
 
@@ -56,15 +55,32 @@ def plate_sinkage(terrain: TerrainMap) -> jax.Array:
     return jnp.where(terrain.deformable, (50e3 / stiffness) ** (1 / soils.n), 0.0)
 
 
+def poses_ahead(chassis: Chassis) -> tuple[np.ndarray, np.ndarray]:
+    """Poses on the arcs, in the yaw frame: x, y in m `[P, 2]` and heading in rad `[P]`."""
+    curvature = np.tan(_LARGEST_STEERING * _STEERING)[:, None] / chassis.wheelbase
+    distance = _STATIONS * chassis.wheelbase
+    heading = curvature * distance
+    # sinc is exact for the straight arc, where the radius is infinite.
+    chord = distance * np.sinc(heading / (2 * np.pi))
+    xy = np.stack([chord * np.cos(heading / 2), chord * np.sin(heading / 2)], axis=-1)
+    here = np.zeros((1, 2)), np.zeros(1)
+    return np.concatenate([here[0], xy.reshape(-1, 2)]), np.append(here[1], heading)
+
+
 def observe(
-    terrain: TerrainMap, state: VehicleState, goal: jax.Array, action: jax.Array
+    terrain: TerrainMap,
+    chassis: Chassis,
+    state: VehicleState,
+    goal: jax.Array,
+    action: jax.Array,
 ) -> jax.Array:
     """`[OBSERVATION_SIZE]` float32 seen by one vehicle on the selected world.
 
     In order: roll, pitch; v_body; omega_body; distance to the goal, cosine and sine of its
-    bearing; the last action; on a fan of points that reaches 21 m ahead, heights of ground and
-    obstacles relative to the vehicle, slopes of the ground ahead and to the left; on a coarser
-    fan friction and plate sinkage, -1 off the map.
+    bearing; the last action; what the ground would do to the vehicle here and at places on nine
+    arcs up to six wheelbases long (mean height under the wheels against now, rise, bank, and
+    twist, which lifts wheels), obstacles included; friction and plate sinkage at some of them, -1
+    off the map.
 
     goal: `[3]` m; action: `[2]` in [-1, 1].
     """
@@ -82,19 +98,28 @@ def observe(
     )
 
     # Written out: a matmul may round map coordinates to ten bits on an accelerator.
-    x, y = _POINTS[:, 0], _POINTS[:, 1]
-    xy = state.position[:2] + jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-    ground = query.surface(terrain, xy)
-    heights = ground.height + obstacles.height_above_ground(terrain, xy) - state.position[2]
-    # Slopes too: far away they are small differences of large heights, which a network that is
-    # fed normalised heights alone is slow to make out.
-    slope_x, slope_y = ground.gradient[:, 0], ground.gradient[:, 1]
-    ahead, left = cos * slope_x + sin * slope_y, cos * slope_y - sin * slope_x
+    def at(points: np.ndarray) -> jax.Array:
+        x, y = points[..., 0], points[..., 1]
+        return state.position[:2] + jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
-    sinkage = plate_sinkage(terrain)[ground.semantic[_CLASSES]] / _SINKAGE_SCALE
-    classes = jnp.stack([ground.friction[_CLASSES], sinkage], axis=-1)
-    on_map = edge_distance(terrain, xy[_CLASSES]) >= 0
-    classes = jnp.where(on_map[:, None], classes, -1.0)
+    place, heading = poses_ahead(chassis)
+    forward = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * chassis.wheelbase / 2
+    left = np.stack([-np.sin(heading), np.cos(heading)], axis=-1) * chassis.track / 2
+    corners = (forward + left, forward - left, -forward + left, -forward - left)
+    xy = at(np.stack([place + corner for corner in corners]))
+    fl, fr, rl, rr = query.height(terrain, xy) + obstacles.height_above_ground(terrain, xy)
+    ground = (
+        ((fl + fr + rl + rr) / 4 - state.position[2]) / _HEIGHT_SCALE,
+        (fl + fr - rl - rr) / (2 * chassis.wheelbase * _SLOPE_SCALE),
+        (fl + rl - fr - rr) / (2 * chassis.track * _SLOPE_SCALE),
+        (fl + rr - fr - rl) / (2 * chassis.track * _TWIST_SCALE),
+    )
 
-    observation = jnp.concatenate([*motion, heights / _HEIGHT_SCALE, ahead, left, classes.ravel()])
+    xy = at(place[_CLASSES])
+    below = query.surface(terrain, xy)
+    sinkage = plate_sinkage(terrain)[below.semantic] / _SINKAGE_SCALE
+    classes = jnp.stack([below.friction, sinkage], axis=-1)
+    classes = jnp.where((edge_distance(terrain, xy) >= 0)[:, None], classes, -1.0)
+
+    observation = jnp.concatenate([*motion, *ground, classes.ravel()])
     return jnp.clip(observation, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vertiwm_jax.env.tasks import Chassis
+from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.terrain.map import TerrainMap
 
 _PIXELS_A_VERTEX = 4

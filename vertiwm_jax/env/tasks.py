@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.geometry import wrap
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
@@ -33,22 +34,6 @@ class Tasks:
     start: jax.Array
     yaw: jax.Array
     goal: jax.Array
-
-
-@dataclasses.dataclass(frozen=True)
-class Chassis:
-    """What an environment must know of the vehicle's shape, m; the HMMWV by default.
-
-    length, width: the rectangle that must stay clear of obstacles.
-    wheelbase, track: where the wheels touch the ground.
-    axle_height: of the body origin above level ground.
-    """
-
-    length: float = 4.6
-    width: float = 2.2
-    wheelbase: float = 3.378
-    track: float = 1.82
-    axle_height: float = 0.47
 
 
 @dataclasses.dataclass(frozen=True)

@@ -46,6 +46,14 @@ LEAST_UPRIGHT = 0.2
 HULL_SECONDS = 0.1
 """Time in which the hull, lying on ground, would drop by its depth under the weight."""
 HULL_FRICTION = 0.5
+HULL_LOAD = 10.0
+"""Largest force on the hull, in vehicle weights."""
+HULL_DEPTH = 0.1
+"""Depth, m, beyond which the hull is pushed out no faster: what is deep in comes out slowly."""
+CLIMB_SPEED = 2.0
+"""Speed, m/s, at which a wheel that finds itself in the ground is lifted out of it."""
+CREEP_SPEED = 0.01
+"""Slip speed, m/s, below which the damping of friction is that of sticking."""
 
 
 @struct.dataclass
@@ -184,14 +192,15 @@ def _substep(
     velocity = velocity_at(body.twist, arm)
     ahead, drift = velocity.dot(rolling), velocity.dot(lateral)
 
-    press = _suspend(vehicle, wheels, history.travel, velocity.dot(n), seconds)
+    press = _suspend(vehicle, wheels, history.travel, history.sinkage, velocity.dot(n), seconds)
     rut = jnp.concatenate([jnp.zeros(2), history.rut])
     ground, sinkage, load, rate = _support(params, wheels, press, history, ahead, drift, rut)
 
     # What friction loses per slip: the secant to no friction at no slip.
     radius = vehicle.wheel_radius
-    sliding = jnp.sqrt((ahead - radius * history.wheel_speed) ** 2 + drift**2 + ADHESION_SPEED**2)
-    grip = jnp.sqrt((ground.torque / radius) ** 2 + ground.lateral**2) / sliding
+    sliding = jnp.sqrt((ahead - radius * history.wheel_speed) ** 2 + drift**2 + CREEP_SPEED**2)
+    still = (CREEP_SPEED / ADHESION_SPEED * load) ** 2 + 1.0
+    grip = jnp.sqrt((ground.torque / radius) ** 2 + ground.lateral**2 + still) / sliding
 
     # Wheel spin is eliminated: traction is what is left of it once the spin has answered.
     drive, brake = _drivetrain(vehicle, pedal, history.wheel_speed)
@@ -247,7 +256,12 @@ class _Press(NamedTuple):
 
 
 def _suspend(
-    vehicle: Vehicle, wheels: Touch, travel: jax.Array, leaving: jax.Array, seconds: float
+    vehicle: Vehicle,
+    wheels: Touch,
+    travel: jax.Array,
+    sinkage: jax.Array,
+    leaving: jax.Array,
+    seconds: float,
 ) -> _Press:
     """Implicit Euler of a massless wheel between spring, damper, its weight and the ground.
 
@@ -258,11 +272,13 @@ def _suspend(
     stiffness = vehicle.spring + damping
     relaxed = vehicle.spring * vehicle.free_travel + damping * travel - vehicle.wheel_weight
     droop = relaxed / stiffness
-    depth = wheels.depth + upright * (travel - droop) - seconds * leaving
+    stepped_in = jnp.minimum(wheels.depth, sinkage + CLIMB_SPEED * seconds)
+    depth = stepped_in + upright * (travel - droop) - seconds * leaving
     carrying = (wheels.normal.z > LEAST_UPRIGHT) & (depth > 0)
     # Beyond the largest load a contact yields: no wheel is thrown out of ground it stepped into.
     largest = LARGEST_LOAD * vehicle.mass * GRAVITY
-    stiffness = jnp.minimum(stiffness / upright**2, largest / jnp.where(carrying, depth, 1.0))
+    pressed = jnp.maximum(depth - sinkage, LEAST_SINKAGE)
+    stiffness = jnp.minimum(stiffness / upright**2, largest / pressed)
     return _Press(droop, depth, upright, jnp.where(carrying, stiffness, 0.0), carrying)
 
 
@@ -354,9 +370,9 @@ def _hull_contact(
     velocity = velocity_at(twist, arm)
     stiffness = 2 * vehicle.mass / HULL_SECONDS**2
     rate = stiffness * (seconds + HULL_SECONDS)
-    load = stiffness * hull.depth - rate * velocity.dot(n)
-    load = jnp.minimum(load, LARGEST_LOAD * vehicle.mass * GRAVITY)
-    pressing = (hull.depth > 0) & (load > 0) & ~(hull.soft & (n.z > 0))
+    load = stiffness * jnp.minimum(hull.depth, HULL_DEPTH) - rate * velocity.dot(n)
+    load = jnp.minimum(load, HULL_LOAD * vehicle.mass * GRAVITY)
+    pressing = (hull.depth > 0) & (load > 0) & ~(hull.soft & (n.z > LEAST_UPRIGHT))
     load, rate = jnp.where(pressing, load, 0.0), jnp.where(pressing, rate, 0.0)
     ahead, drift = velocity.dot(forward), velocity.dot(left)
     grip = HULL_FRICTION * load * jax.lax.rsqrt(ahead**2 + drift**2 + ADHESION_SPEED**2)

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.env.tasks import Chassis, Tasks, circle_tasks, random_tasks
+from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env.tasks import Tasks, circle_tasks, random_tasks
 from vertiwm_jax.terrain import files, vertibench, worlds
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.worlds import MEDIAN_SLOPE_DEG, WorldConfig

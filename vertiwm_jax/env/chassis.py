@@ -1,0 +1,19 @@
+"""The shape of a vehicle, as far as an environment must know it."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Chassis:
+    """What an environment must know of the vehicle's shape, m; the HMMWV by default.
+
+    length, width: the rectangle that must stay clear of obstacles.
+    wheelbase, track: where the wheels touch the ground.
+    axle_height: of the body origin above level ground.
+    """
+
+    length: float = 4.6
+    width: float = 2.2
+    wheelbase: float = 3.378
+    track: float = 1.82
+    axle_height: float = 0.47
