@@ -16,7 +16,7 @@ from benchmarks._harness import Figures, measure, parser, report
 from vertiwm_jax import ppo as door
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.rl import task
-from vertiwm_jax.rl.ppo import PPO, PPOConfig
+from vertiwm_jax.rl.ppo import PPO
 
 
 @struct.dataclass
@@ -42,20 +42,20 @@ class IdleEnv(environment.Environment):
         return spaces.Box(-1.0, 1.0, (2,))
 
 
-def iteration(env: environment.Environment, params: Any, config: PPOConfig) -> Figures:
-    ppo = PPO(env, config)
+def iteration(ppo: PPO, params: Any, repeat: int = 1) -> Figures:
     state = jax.jit(ppo.init)(params, jax.random.key(0))
     figures = measure(jax.jit(ppo.iterate), params, state, repeats=3)
-    return {"transitions_per_s": config.batch / figures["median_s"], **figures}
+    return {"transitions_per_s": repeat * ppo.config.batch / figures["median_s"], **figures}
 
 
 def main() -> None:
     arguments = parser(__doc__).parse_args()
     config = door.TrainConfig()
     params = environment.EnvParams(max_steps_in_episode=600)
-    results = {"algorithm alone": iteration(IdleEnv(), params, config.ppo)}
+    results = {"algorithm alone": iteration(PPO(IdleEnv(), config.ppo), params)}
     env, params, _ = task.environments(config)
-    results["built-in simulator"] = iteration(env, params, config.ppo)
+    ppo = door.algorithm(config, env)
+    results["built-in simulator"] = iteration(ppo, params, config.action_repeat)
     report("ppo_throughput", results, arguments.json)
 
 

@@ -139,8 +139,8 @@ def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:
     grounds = replace(config.ground, pairs=command.pairs or config.ground.pairs)
     if not command.difficulties:
         return replace(config, ground=grounds)
-    procedural = replace(grounds.procedural, difficulties=command.difficulties)
-    return replace(config, worlds=None, ground=replace(grounds, procedural=procedural))
+    testing = replace(grounds.testing, difficulties=command.difficulties)
+    return replace(config, worlds=None, ground=replace(grounds, testing=testing))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import jax
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
+from vertiwm_jax.env.repeat import ActionRepeat
 from vertiwm_jax.evaluation import plots, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
 from vertiwm_jax.evaluation.navigation import Policy
@@ -47,6 +49,10 @@ class TrainConfig(TaskConfig):
     """Folder of an earlier run to go on with; what is set beside changes its configuration."""
     compile_cache: Path | None = None
     """Folder that keeps compiled programs for later runs."""
+    action_repeat: int = 4
+    """Steps of 0.1 s that an action is held while learning; ppo.transitions counts actions."""
+    base: Literal["look ahead", "straight to goal", "none"] = "look ahead"
+    """The controller that the policy learns to correct."""
     ppo: PPOConfig = PPOConfig()
     """The algorithm."""
     loop: LoopConfig = LoopConfig()
@@ -71,11 +77,11 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def learned(config: TrainConfig, env: NavigationEnv, params: NavigationParams, run: Path) -> Rows:
     """The policies of the run in the folder `run`, one a seed; `CheckpointError` if none."""
-    algorithm = _algorithm(config, env)
-    restored = restore(algorithm, params, run, config.loop.seeds)
+    ppo = algorithm(config, env)
+    restored = restore(ppo, params, run, config.loop.seeds)
     if restored is None:
         raise CheckpointError(f"{run}: expected checkpoints of a training, found none")
-    return _policies(config, algorithm, params, restored[1])
+    return _policies(config, ppo, params, restored[1])
 
 
 def _configuration(argv: Sequence[str] | None) -> TrainConfig:
@@ -86,16 +92,16 @@ def _configuration(argv: Sequence[str] | None) -> TrainConfig:
     return configuration.parse(TrainConfig, file, argv, "python -m vertiwm_jax.ppo")
 
 
-def _algorithm(config: TrainConfig, env: NavigationEnv) -> PPO:
-    return PPO(env, config.ppo, task.outcomes)
+def algorithm(config: TrainConfig, env: NavigationEnv) -> PPO:
+    """PPO on the task as the configuration has it."""
+    base = None if config.base == "none" else baselines(config.navigation)[config.base]
+    return PPO(ActionRepeat(env, config.action_repeat), config.ppo, task.outcomes, base)
 
 
-def _policies(
-    config: TrainConfig, algorithm: PPO, params: NavigationParams, state: TrainState
-) -> Rows:
+def _policies(config: TrainConfig, ppo: PPO, params: NavigationParams, state: TrainState) -> Rows:
     names = [f"ppo, seed {seed}" for seed in range(config.loop.seeds)]
     return {
-        name: algorithm.policy(params, jax.tree.map(lambda x, seed=seed: x[seed], state))
+        name: ppo.policy(params, jax.tree.map(lambda x, seed=seed: x[seed], state))
         for seed, name in enumerate(names if len(names) > 1 else ["ppo"])
     }
 
@@ -107,14 +113,14 @@ def _train_and_report(config: TrainConfig) -> Path:
         env, params, test = task.environments(config)
     except ValueError as error:  # what is wrong with the maps, or with the tasks on them
         sys.exit(f"error: {error}")
-    algorithm = _algorithm(config, env)
-    seeds, iterations, batch = config.loop.seeds, config.ppo.iterations, config.ppo.batch
-    restored = restore(algorithm, params, config.resume, seeds) if config.resume else None
+    ppo, seeds, iterations = algorithm(config, env), config.loop.seeds, config.ppo.iterations
+    steps = config.ppo.batch * config.action_repeat
+    restored = restore(ppo, params, config.resume, seeds) if config.resume else None
     with _open(config, restored[0] if restored else 0) as run:
         print(f"run folder {run.folder}; training on {params.terrain.worlds} worlds", flush=True)
         key = config.key("training")
-        state = train(algorithm, params, key, run, iterations, batch, config.loop, restored)
-        policies = _policies(config, algorithm, params, state) | baselines(config.navigation)
+        state = train(ppo, params, key, run, iterations, steps, config.loop, restored)
+        policies = _policies(config, ppo, params, state) | baselines(config.navigation)
         _report(run, config, test, drive(env, test, policies, config.key("testing")))
     return run.folder
 

@@ -5,12 +5,14 @@ import pytest
 from env.worlds import GRASS, SNOW, hills
 
 from vertiwm_jax.env import observation
+from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 
-observe = jax.jit(observation.observe)
+CHASSIS = Chassis()
+observe = jax.jit(observation.observe, static_argnums=1)
 OBSTACLE = np.array([[9.0, 3.0, 4.0, 6.0, 2.0]], np.float32)
-HEIGHTS, CLASSES = slice(13, 13 + 99), slice(13 + 99, None)
+CLASSES = slice(observation.GROUND.stop, None)
 
 
 def vehicle(x, y, yaw):
@@ -31,7 +33,7 @@ def world(origin=None):
 
 def test_layout_and_units():
     goal, action = jnp.array([20.0, 1.0, 2.5]), jnp.array([0.5, -0.25])
-    seen = np.asarray(observe(world(), vehicle(0.0, 1.0, 0.0), goal, action))
+    seen = np.asarray(observe(world(), CHASSIS, vehicle(0.0, 1.0, 0.0), goal, action))
     assert seen.shape == (observation.OBSERVATION_SIZE,) and seen.dtype == np.float32
     motion = [0.1 / 0.5, -0.2 / 0.5, 3 / 5, 0.1 / 5, -0.2 / 5, 0.1, 0.2, 0.3]
     np.testing.assert_allclose(seen[:8], motion, rtol=1e-6)
@@ -41,28 +43,28 @@ def test_layout_and_units():
 
 def test_the_goal_is_in_the_frame_of_the_vehicle():
     left = jnp.array([0.0, 30.0, 2.5])
-    seen = observe(world(), vehicle(0.0, 0.0, jnp.pi / 6), left, jnp.zeros(2))
+    seen = observe(world(), CHASSIS, vehicle(0.0, 0.0, jnp.pi / 6), left, jnp.zeros(2))
     expected = [0.6, np.cos(np.pi / 3), np.sin(np.pi / 3)]
     np.testing.assert_allclose(seen[observation.GOAL], expected, atol=1e-6)
 
 
 def test_moving_the_world_changes_nothing():
     goal, action = jnp.array([20.0, -7.0, 2.0]), jnp.zeros(2)
-    here = observe(world(), vehicle(2.0, 1.0, 0.4), goal, action)
+    here = observe(world(), CHASSIS, vehicle(2.0, 1.0, 0.4), goal, action)
     shift = jnp.array([32.0, -48.0, 0.0])
     moved_world = world(origin=(-64.0 + 32.0, 64.0 - 48.0))
     moved_world = moved_world.replace(
         obstacles=moved_world.obstacles + jnp.append(shift[:2], jnp.zeros(3))
     )
     moved = vehicle(2.0 + 32.0, 1.0 - 48.0, 0.4)
-    np.testing.assert_allclose(observe(moved_world, moved, goal + shift, action), here, atol=2e-5)
+    np.testing.assert_allclose(observe(moved_world, CHASSIS, moved, goal + shift, action), here, atol=2e-5)
 
 
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3])
 def test_turning_the_world_changes_nothing(quarter_turns):
     still = world()
     goal, action = jnp.array([20.0, -7.0, 2.0]), jnp.zeros(2)
-    here = observe(still, vehicle(2.0, 1.0, 0.4), goal, action)
+    here = observe(still, CHASSIS, vehicle(2.0, 1.0, 0.4), goal, action)
 
     def turn(x, y):
         for _ in range(quarter_turns):
@@ -80,19 +82,24 @@ def test_turning_the_world_changes_nothing(quarter_turns):
     )
     there = vehicle(*turn(2.0, 1.0), 0.4 + quarter_turns * jnp.pi / 2)
     turned_goal = jnp.array([*turn(20.0, -7.0), 2.0])
-    np.testing.assert_allclose(observe(turned, there, turned_goal, action), here, atol=2e-4)
+    np.testing.assert_allclose(observe(turned, CHASSIS, there, turned_goal, action), here, atol=2e-4)
 
 
 def test_obstacles_soil_and_the_edge_are_seen():
     terrain = world()
     goal = jnp.array([0.0, 30.0, 0.0])
     beside = vehicle(4.0, 3.0, 0.0)
-    seen = observe(terrain, beside, goal, jnp.zeros(2))
+    seen = observe(terrain, CHASSIS, beside, goal, jnp.zeros(2))
     bare = observe(
-        terrain.replace(obstacles=jnp.zeros_like(terrain.obstacles)), beside, goal, jnp.zeros(2)
+        terrain.replace(obstacles=jnp.zeros_like(terrain.obstacles)),
+        CHASSIS,
+        beside,
+        goal,
+        jnp.zeros(2),
     )
-    raised = np.asarray(seen - bare)[HEIGHTS]
-    assert set(np.round(raised, 4)) == {0.0, 1.0}  # 2 m over the scale of 2 m
+    raised, *_ = observation.arcs_ahead(seen) - np.stack(observation.arcs_ahead(bare))
+    # 2 m over the scale of 2 m, if all four wheels stand on it.
+    assert set(np.round(np.ravel(raised), 4)) == {0.0, 0.25, 0.5, 0.75, 1.0}
 
     friction, sinkage = np.asarray(seen)[CLASSES].reshape(-1, 2).T
     snow = sinkage > 0
@@ -100,7 +107,7 @@ def test_obstacles_soil_and_the_edge_are_seen():
     np.testing.assert_allclose(friction[~snow], 0.36, rtol=1e-6)
     assert (friction[snow] == 0).all()
 
-    outward = observe(terrain, vehicle(60.0, 0.0, 0.0), goal, jnp.zeros(2))
+    outward = observe(terrain, CHASSIS, vehicle(60.0, 0.0, 0.0), goal, jnp.zeros(2))
     friction = np.asarray(outward)[CLASSES].reshape(-1, 2)[:, 0]
     assert (friction == -1).any() and (friction > 0).any()
 
@@ -118,6 +125,6 @@ def test_gradients_are_finite_at_the_goal():
 
     def total(position):
         moved = state.replace(position=position)
-        return observation.observe(terrain, moved, state.position, jnp.zeros(2)).sum()
+        return observation.observe(terrain, CHASSIS, moved, state.position, jnp.zeros(2)).sum()
 
     assert jnp.isfinite(jax.jit(jax.grad(total))(state.position)).all()

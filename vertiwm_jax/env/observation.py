@@ -15,11 +15,11 @@ from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
 
 # Where the vehicle would stand on arcs of constant steering: as far as a choice made now reaches.
-_STEERING = np.linspace(-1.0, 1.0, 9)  # of the front wheels' largest angle
-_STATIONS = np.array([0.45, 0.9, 1.4, 2.0, 2.7, 3.5, 4.5, 6.0])  # wheelbases along an arc
+ARC_STEERING = np.linspace(-1.0, 1.0, 9)  # of the front wheels' largest angle
+ARC_STATIONS = np.array([0.45, 0.9, 1.4, 2.0, 2.7, 3.5, 4.5, 6.0])  # wheelbases along an arc
 _LARGEST_STEERING = 0.37  # rad
-_POSES = 1 + _STEERING.size * _STATIONS.size  # the first is where it stands now
-_CLASSES = 1 + np.arange(_STEERING.size * _STATIONS.size).reshape(9, 8)[::4, ::2].ravel()
+_POSES = 1 + ARC_STEERING.size * ARC_STATIONS.size  # the first is where it stands now
+_CLASSES = 1 + np.arange(ARC_STEERING.size * ARC_STATIONS.size).reshape(9, 8)[::4, ::2].ravel()
 
 _ANGLE_SCALE = 0.5  # rad
 _SPEED_SCALE = 5.0  # m/s
@@ -27,11 +27,14 @@ _DISTANCE_SCALE = 50.0  # m
 _HEIGHT_SCALE = 2.0  # m
 _SLOPE_SCALE = 0.4
 _TWIST_SCALE = 0.2
+_CROWN_SCALE = 0.2  # m
 _SINKAGE_SCALE = 0.1  # m
 
 GOAL = slice(8, 11)
 """Where the observation holds the distance over 50 m and the cosine and sine of the bearing."""
-OBSERVATION_SIZE = 13 + 4 * _POSES + 2 * _CLASSES.size
+OBSERVATION_SIZE = 13 + 5 * _POSES + 2 * _CLASSES.size
+GROUND = slice(13, 13 + 5 * _POSES)
+"""Where it holds height, crown, rise, bank and twist, of all places in turn."""
 OBSERVATION_LIMIT = 10.0
 """Every entry is clipped to this size."""
 
@@ -55,10 +58,18 @@ def plate_sinkage(terrain: TerrainMap) -> jax.Array:
     return jnp.where(terrain.deformable, (50e3 / stiffness) ** (1 / soils.n), 0.0)
 
 
+def arcs_ahead(observation: jax.Array) -> tuple[jax.Array, ...]:
+    """Height, crown, rise, bank and twist `[..., arcs, stations]`, scaled as observed."""
+    shape = (*observation.shape[:-1], 5, _POSES)
+    here_and_ahead = observation[..., GROUND].reshape(shape)
+    ahead = here_and_ahead[..., 1:].reshape(*shape[:-1], ARC_STEERING.size, ARC_STATIONS.size)
+    return tuple(jnp.moveaxis(ahead, -3, 0))
+
+
 def poses_ahead(chassis: Chassis) -> tuple[np.ndarray, np.ndarray]:
     """Poses on the arcs, in the yaw frame: x, y in m `[P, 2]` and heading in rad `[P]`."""
-    curvature = np.tan(_LARGEST_STEERING * _STEERING)[:, None] / chassis.wheelbase
-    distance = _STATIONS * chassis.wheelbase
+    curvature = np.tan(_LARGEST_STEERING * ARC_STEERING)[:, None] / chassis.wheelbase
+    distance = ARC_STATIONS * chassis.wheelbase
     heading = curvature * distance
     # sinc is exact for the straight arc, where the radius is infinite.
     chord = distance * np.sinc(heading / (2 * np.pi))
@@ -78,9 +89,9 @@ def observe(
 
     In order: roll, pitch; v_body; omega_body; distance to the goal, cosine and sine of its
     bearing; the last action; what the ground would do to the vehicle here and at places on nine
-    arcs up to six wheelbases long (mean height under the wheels against now, rise, bank, and
-    twist, which lifts wheels), obstacles included; friction and plate sinkage at some of them, -1
-    off the map.
+    arcs up to six wheelbases long, obstacles included (mean height under the wheels against now;
+    crown between them, which the belly meets; rise; bank; twist, which lifts wheels); friction
+    and plate sinkage at some of the places, -1 off the map.
 
     goal: `[3]` m; action: `[2]` in [-1, 1].
     """
@@ -106,10 +117,12 @@ def observe(
     forward = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * chassis.wheelbase / 2
     left = np.stack([-np.sin(heading), np.cos(heading)], axis=-1) * chassis.track / 2
     corners = (forward + left, forward - left, -forward + left, -forward - left)
-    xy = at(np.stack([place + corner for corner in corners]))
-    fl, fr, rl, rr = query.height(terrain, xy) + obstacles.height_above_ground(terrain, xy)
+    xy = at(np.stack([place, *(place + corner for corner in corners)]))
+    middle, fl, fr, rl, rr = query.height(terrain, xy) + obstacles.height_above_ground(terrain, xy)
+    mean = (fl + fr + rl + rr) / 4
     ground = (
-        ((fl + fr + rl + rr) / 4 - state.position[2]) / _HEIGHT_SCALE,
+        (mean - state.position[2]) / _HEIGHT_SCALE,
+        (middle - mean) / _CROWN_SCALE,
         (fl + fr - rl - rr) / (2 * chassis.wheelbase * _SLOPE_SCALE),
         (fl + rl - fr - rr) / (2 * chassis.track * _SLOPE_SCALE),
         (fl + rr - fr - rl) / (2 * chassis.track * _TWIST_SCALE),

@@ -50,6 +50,8 @@ HULL_LOAD = 10.0
 """Largest force on the hull, in vehicle weights."""
 HULL_DEPTH = 0.1
 """Depth, m, beyond which the hull is pushed out no faster: what is deep in comes out slowly."""
+HULL_SOIL = 0.2
+"""Depth, m, that soil gives way under the belly before it carries."""
 CLIMB_SPEED = 2.0
 """Speed, m/s, at which a wheel that finds itself in the ground is lifted out of it."""
 CREEP_SPEED = 0.01
@@ -76,18 +78,18 @@ class SimulatorParams:
 def chrono_like(vehicle: Vehicle) -> SimulatorParams:
     """Soil contact fitted to Chrono's SCM, on the training drives of an HMMWV.
 
-    SCM soil is far stiffer than Bekker's equation under a wheel: pushed-up soil carries too,
-    normal stress grows with penetration speed, and shear displacement is a path length that
-    never resets, so friction is mobilised early.
+    SCM soil carries more than Bekker's equation under a wheel (pushed-up soil and penetration
+    speed add to it), its normal stress acts along the normal of the ground, and its shear
+    displacement is a path length that never resets, so friction is mobilised early.
     """
     return SimulatorParams(
         vehicle=jax.tree.map(jnp.asarray, vehicle),
         contact=Contact(
-            peak=0.16, peak_slip=0.0, exit=-0.16, unload_stiffness=3e6, creep_speed=ADHESION_SPEED
+            peak=0.0, peak_slip=0.19, exit=-0.45, unload_stiffness=1.2e6, creep_speed=ADHESION_SPEED
         ),
-        stiffening=jnp.float32(4.4),
-        shear_scale=jnp.float32(0.4),
-        upright_stress=jnp.float32(0.57),
+        stiffening=jnp.float32(1.36),
+        shear_scale=jnp.float32(0.33),
+        upright_stress=jnp.float32(0.6),
     )
 
 
@@ -363,16 +365,17 @@ def _hull_contact(
 ) -> list[ContactForce]:
     """The chassis on the ground: a heavily damped spring, and friction.
 
-    Soil gives way under the belly, as in Chrono, whose SCM feels wheels only; not on the roof.
+    Soil gives way under the belly for a while: Chrono's SCM feels wheels only.
     """
     arm, n = hull.point.plus(centre, -1.0), hull.normal
     forward, left = _tangents(n, jnp.ones(1), jnp.zeros(1))
     velocity = velocity_at(twist, arm)
     stiffness = 2 * vehicle.mass / HULL_SECONDS**2
     rate = stiffness * (seconds + HULL_SECONDS)
-    load = stiffness * jnp.minimum(hull.depth, HULL_DEPTH) - rate * velocity.dot(n)
+    depth = hull.depth - jnp.where(hull.soft & (n.z > LEAST_UPRIGHT), HULL_SOIL, 0.0)
+    load = stiffness * jnp.minimum(depth, HULL_DEPTH) - rate * velocity.dot(n)
     load = jnp.minimum(load, HULL_LOAD * vehicle.mass * GRAVITY)
-    pressing = (hull.depth > 0) & (load > 0) & ~(hull.soft & (n.z > LEAST_UPRIGHT))
+    pressing = (depth > 0) & (load > 0)
     load, rate = jnp.where(pressing, load, 0.0), jnp.where(pressing, rate, 0.0)
     ahead, drift = velocity.dot(forward), velocity.dot(left)
     grip = HULL_FRICTION * load * jax.lax.rsqrt(ahead**2 + drift**2 + ADHESION_SPEED**2)

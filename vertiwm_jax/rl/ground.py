@@ -19,11 +19,13 @@ from vertiwm_jax.terrain.worlds import MEDIAN_SLOPE_DEG, WorldConfig
 class GroundConfig:
     """Where policies learn and where they are tested."""
 
-    procedural: WorldConfig = WorldConfig()
-    """What is drawn unless maps are given."""
+    training: WorldConfig = WorldConfig(difficulties=("mid", "high"))
+    """Procedural worlds to train on, unless maps are given; low ones teach little."""
+    testing: WorldConfig = WorldConfig()
+    """Procedural worlds to test on."""
     train_worlds: int = 180
     """Procedural worlds to train on."""
-    held_out_worlds: int = 15
+    held_out_worlds: int = 18
     """Procedural worlds to test on."""
     held_out_every: int = 5
     """Of given maps, every so-manieth is not trained on but tested on."""
@@ -43,13 +45,11 @@ def grounds(
     path: see `load`. Too few maps to hold any out raise `ValueError`.
     """
     if path is None:
-        train, held_out = (
-            worlds.generate(jax.random.split(part, count), config.procedural)
-            for part, count in zip(
-                jax.random.split(key), (config.train_worlds, config.held_out_worlds), strict=True
-            )
+        train_key, test_key = jax.random.split(key)
+        return (
+            worlds.generate(jax.random.split(train_key, config.train_worlds), config.training),
+            worlds.generate(jax.random.split(test_key, config.held_out_worlds), config.testing),
         )
-        return train, held_out
     terrain = load(path)
     if terrain.worlds < config.held_out_every:
         raise ValueError(

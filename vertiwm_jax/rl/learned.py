@@ -10,7 +10,7 @@ from flax import struct
 from vertiwm_jax.networks.policy import Actor, Gaussian
 from vertiwm_jax.rl.normalise import RunningStatistics
 
-Controller = Callable[[jax.Array, jax.Array | None], jax.Array]
+Controller = Callable[[jax.Array, Any], jax.Array]
 """`(observation [..., O], key)` to actions `[..., A]` in [-1, 1]."""
 
 
