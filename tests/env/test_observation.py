@@ -41,6 +41,62 @@ def test_layout_and_units():
     np.testing.assert_allclose(seen[11:13], action)
 
 
+def test_poses_lie_on_the_arcs_of_a_bicycle():
+    xy, heading = observation.poses_ahead(CHASSIS)
+    assert xy[0].tolist() == [0, 0] and heading[0] == 0
+    shape = observation.ARC_STEERING.size, observation.ARC_STATIONS.size
+    x, y = xy[1:].reshape(*shape, 2).transpose(2, 0, 1)
+    heading = heading[1:].reshape(shape)
+    driven = CHASSIS.wheelbase * observation.ARC_STATIONS
+    np.testing.assert_allclose(x[4], driven)
+    np.testing.assert_allclose([y[4], heading[4]], 0, atol=1e-12)
+    # The sharpest one, to the left, goes round (0, radius).
+    radius = CHASSIS.wheelbase / np.tan(0.37)
+    np.testing.assert_allclose(np.hypot(x[-1], y[-1] - radius), radius)
+    np.testing.assert_allclose(np.arctan2(x[-1], radius - y[-1]), driven / radius)
+    np.testing.assert_allclose(heading[-1], driven / radius)
+    np.testing.assert_allclose([x[0], -y[0], -heading[0]], [x[-1], y[-1], heading[-1]])
+
+
+def on_ground(height):
+    """What the ground does to a vehicle at (0, 0) that looks 0.4 rad to the north of east."""
+    x = np.arange(-64.0, 65.0)
+    terrain = terrain_map.build(
+        height(*np.meshgrid(x, -x)), np.full((16, 16), GRASS), elevation_range=(-1000, 1000)
+    )
+    seen = observe(terrain, CHASSIS, vehicle(0.0, 0.0, 0.4), jnp.ones(3), jnp.zeros(2))
+    return np.asarray(seen)[observation.GROUND].reshape(5, -1)
+
+
+def test_a_plane_rises_and_banks_and_nothing_else():
+    height, crown, rise, bank, twist = on_ground(lambda x, y: 0.2 * x + 0.1 * y)
+    place, heading = observation.poses_ahead(CHASSIS)
+    direction = heading + 0.4
+    np.testing.assert_allclose(
+        rise, (0.2 * np.cos(direction) + 0.1 * np.sin(direction)) / 0.4, atol=1e-3
+    )
+    np.testing.assert_allclose(
+        bank, (0.1 * np.cos(direction) - 0.2 * np.sin(direction)) / 0.4, atol=1e-3
+    )
+    np.testing.assert_allclose([crown, twist], 0, atol=2e-3)
+    turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
+    expected = (place @ turn.T @ [0.2, 0.1] - 2.5) / 2
+    np.testing.assert_allclose(height, expected, atol=1e-3)
+
+
+def test_a_saddle_twists_and_a_hump_crowns():
+    # At the origin, z = u v / 40 along and across the vehicle: four equal heights, signs in turn.
+    cos, sin = np.cos(0.4), np.sin(0.4)
+    saddle = on_ground(lambda x, y: (cos * x + sin * y) * (cos * y - sin * x) / 40)[:, 0]
+    lifted = CHASSIS.wheelbase * CHASSIS.track / 4 / 40
+    np.testing.assert_allclose(saddle[4], 4 * lifted / (2 * CHASSIS.track * 0.2), atol=0.02)
+    np.testing.assert_allclose(saddle[1:4], 0, atol=0.02)
+    hump = on_ground(lambda x, y: -(x**2 + y**2) / 20)[:, 0]
+    corner = (CHASSIS.wheelbase**2 + CHASSIS.track**2) / 4
+    np.testing.assert_allclose(hump[1], corner / 20 / 0.2, atol=0.1)  # bilinear between metres
+    np.testing.assert_allclose(hump[2:], 0, atol=0.05)
+
+
 def test_the_goal_is_in_the_frame_of_the_vehicle():
     left = jnp.array([0.0, 30.0, 2.5])
     seen = observe(world(), CHASSIS, vehicle(0.0, 0.0, jnp.pi / 6), left, jnp.zeros(2))
@@ -57,7 +113,9 @@ def test_moving_the_world_changes_nothing():
         obstacles=moved_world.obstacles + jnp.append(shift[:2], jnp.zeros(3))
     )
     moved = vehicle(2.0 + 32.0, 1.0 - 48.0, 0.4)
-    np.testing.assert_allclose(observe(moved_world, CHASSIS, moved, goal + shift, action), here, atol=2e-5)
+    np.testing.assert_allclose(
+        observe(moved_world, CHASSIS, moved, goal + shift, action), here, atol=2e-5
+    )
 
 
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3])
@@ -82,7 +140,9 @@ def test_turning_the_world_changes_nothing(quarter_turns):
     )
     there = vehicle(*turn(2.0, 1.0), 0.4 + quarter_turns * jnp.pi / 2)
     turned_goal = jnp.array([*turn(20.0, -7.0), 2.0])
-    np.testing.assert_allclose(observe(turned, CHASSIS, there, turned_goal, action), here, atol=2e-4)
+    np.testing.assert_allclose(
+        observe(turned, CHASSIS, there, turned_goal, action), here, atol=2e-4
+    )
 
 
 def test_obstacles_soil_and_the_edge_are_seen():

@@ -26,11 +26,41 @@ def test_circle_must_fit():
         tasks.circle_tasks(ground(), radius=70)
 
 
+def test_slope_around_a_plane_is_its_own():
+    x = np.arange(129.0)
+    plane = ground(0.06 * x + 0.05 * x[:, None]).select(0)
+    points = jnp.array([[0.0, 0.0], [20.3, -31.7]])
+    np.testing.assert_allclose(
+        tasks.slope_around(plane, points), np.arctan(np.hypot(0.06, 0.05)), rtol=1e-3
+    )
+
+
+def test_sway_turns_starts_to_level_ground():
+    # Rough but for the quadrant north-east of the middle; south-east in the second world.
+    rough = 1 + np.sin(np.add.outer(np.arange(129.0), np.arange(129.0)))
+    rough[:64, 65:] = 1
+    terrain = terrain_map.stack([ground(rough), ground(rough[::-1].copy())])
+    still, swayed = (tasks.circle_tasks(terrain, pairs=4, sway=s) for s in (0.0, np.pi / 4))
+    np.testing.assert_allclose(np.linalg.norm(swayed.start, axis=-1), 60, rtol=1e-6)
+    np.testing.assert_allclose(swayed.goal, -swayed.start, atol=1e-5)
+    heading = np.stack([np.cos(swayed.yaw), np.sin(swayed.yaw)], axis=-1)
+    np.testing.assert_allclose(heading, (swayed.goal - swayed.start) / 120, atol=1e-5)
+    turned = np.asarray(still.start * swayed.start).sum(-1) / 60**2
+    assert turned.min() >= np.cos(np.pi / 4) - 1e-5
+    # East, north, west, south: two of them reach the level quadrant of their world.
+    slopes = [
+        np.asarray(tasks.slope_around(terrain.select(world), swayed.start[4 * world :][:4]))
+        for world in (0, 1)
+    ]
+    assert (slopes[0] < 0.01).tolist() == [True, True, False, False]
+    assert (slopes[1] < 0.01).tolist() == [True, False, False, True]
+
+
 def test_random_tasks_are_acceptable_and_varied():
     relief = hills(height=4.0)
     blocks = np.array([[x, y, 6, 6, 3] for x in (-30, 0, 30) for y in (-30, 0, 30)])
     terrain = terrain_map.stack([ground(relief, blocks), ground(relief.T.copy(), blocks)])
-    config = RandomTaskConfig(steepest_start=0.4)
+    config = RandomTaskConfig(steepest_start=0.4, roughest_start=0.45)
     pool = tasks.random_tasks(jax.random.key(0), terrain, 200, Chassis(), config)
     assert np.bincount(pool.world).tolist() == [100, 100]
     offset = np.asarray(pool.goal - pool.start)
@@ -48,6 +78,11 @@ def test_random_tasks_are_acceptable_and_varied():
         row, column = (64 - y).round().astype(int), (64 + x).round().astype(int)
         slope = np.hypot(dx[row, column], dy[row, column])
         assert slope.max() < np.tan(0.4) + 0.1
+        around = [
+            (dx**2 + dy**2)[r - 4 : r + 5, c - 4 : c + 5].mean()
+            for r, c in zip(row, column, strict=True)
+        ]
+        assert np.sqrt(max(around)) < np.tan(0.45) + 0.05
 
 
 def test_impossible_random_tasks_say_why():

@@ -278,6 +278,7 @@ def final() -> Callable[..., tuple[jax.Array, tuple]]:
     return lambda *arguments: compiled(*jax.tree.map(np.asarray, arguments))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [CONCRETE, SNOW])
 @pytest.mark.parametrize("start", ["rest", "rolling", "airborne"])
 def test_gradients_are_finite(final, kind, start):
@@ -294,6 +295,7 @@ def test_gradients_are_finite(final, kind, start):
         assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [CONCRETE, SNOW])
 def test_gradients_agree_with_differences(final, kind):
     terrain = ground(lambda x, y: 0.05 * x, kind)
@@ -344,6 +346,47 @@ def test_gradients_agree_with_differences(final, kind):
     for name, (gradient, moved, step) in cases.items():
         difference = float(moved(step)[0] - moved(-step)[0]) / (2 * step)
         assert float(gradient) == pytest.approx(difference, rel=0.1, abs=3e-3), name
+
+
+def test_derivatives_along_a_direction_agree_with_differences():
+    """Forward mode, which compiles fast; the full gradients are tested with `-m slow`."""
+    terrain = {kind: ground(lambda x, y: 0.05 * x, kind) for kind in (CONCRETE, SNOW)}
+    start = replace(at_rest(terrain[SNOW]), velocity=jnp.array([2.0, 0.0, 0.0]))
+
+    def final(state, speed, steering, mass, kphi, terrain):
+        params = replace(PARAMS, vehicle=replace(PARAMS.vehicle, mass=mass * PARAMS.vehicle.mass))
+        terrain = replace(terrain, soils=replace(terrain.soils, kphi=kphi * terrain.soils.kphi))
+        history = SIMULATOR.init(params, terrain, state)
+        commands = Command(jnp.full(8, speed), jnp.full(8, steering))
+        states = rollout(SIMULATOR, params, terrain, history, state, commands)
+        return states.position[-1] @ jnp.array([1.0, 0.7, 0.3])
+
+    @jax.jit
+    def along(arguments, direction, terrain):
+        return jax.jvp(lambda *arguments: final(*arguments, terrain), arguments, direction)
+
+    at = (start, *map(jnp.float32, (3.0, 0.15, 1.0, 1.0)))
+    still = jax.tree.map(jnp.zeros_like, at)
+    forward = replace(still[0], velocity=jnp.array([1.0, 0.0, 0.0]))
+    turn = replace(still[0], rpy=jnp.array([0.0, 0.0, 1.0]))
+    one = jnp.float32(1)
+    directions = {
+        "velocity": ((forward, *still[1:]), 0.05),
+        "yaw": ((turn, *still[1:]), 0.02),
+        "speed": ((*still[:1], one, *still[2:]), 0.05),
+        "steering": ((*still[:2], one, *still[3:]), 0.02),
+        "mass": ((*still[:3], one, *still[4:]), 0.05),
+        "kphi": ((*still[:4], one), 0.05),
+    }
+    for kind, land in terrain.items():
+        for name, (direction, step) in directions.items():
+            _, found = along(at, direction, land)
+            ahead, behind = (
+                along(jax.tree.map(lambda a, d, s=s: a + s * d, at, direction), still, land)[0]
+                for s in (step, -step)
+            )
+            difference = float(ahead - behind) / (2 * step)
+            assert float(found) == pytest.approx(difference, rel=0.1, abs=3e-3), (kind, name)
 
 
 def test_a_batch_is_a_loop_and_commands_do_not_retrace():

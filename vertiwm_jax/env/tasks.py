@@ -87,11 +87,12 @@ def circle_tasks(
 
     world = jnp.arange(terrain.worlds, dtype=jnp.int32)
     angle = jax.vmap(most_level)(world).ravel() if sway else jnp.tile(evenly, terrain.worlds)
+    start = on_circle(angle)
     return Tasks(
         world=jnp.repeat(world, pairs),
-        start=on_circle(angle),
+        start=start,
         yaw=wrap(angle + jnp.pi),
-        goal=on_circle(angle + jnp.pi),
+        goal=2 * middle - start,
     )
 
 

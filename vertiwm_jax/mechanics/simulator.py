@@ -85,11 +85,11 @@ def chrono_like(vehicle: Vehicle) -> SimulatorParams:
     return SimulatorParams(
         vehicle=jax.tree.map(jnp.asarray, vehicle),
         contact=Contact(
-            peak=0.0, peak_slip=0.19, exit=-0.45, unload_stiffness=1.2e6, creep_speed=ADHESION_SPEED
+            peak=0.0, peak_slip=0.04, exit=-0.47, unload_stiffness=6e5, creep_speed=ADHESION_SPEED
         ),
-        stiffening=jnp.float32(1.36),
-        shear_scale=jnp.float32(0.33),
-        upright_stress=jnp.float32(0.6),
+        stiffening=jnp.float32(1.34),
+        shear_scale=jnp.float32(0.8),
+        upright_stress=jnp.float32(0.61),
     )
 
 

@@ -1,0 +1,63 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from env.worlds import GRASS
+
+from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.observation import observe
+from vertiwm_jax.evaluation.controllers import LookAhead
+from vertiwm_jax.state import VehicleState
+from vertiwm_jax.terrain import map as terrain_map
+
+CONFIG = NavigationConfig()
+POLICY = LookAhead(CONFIG)
+
+
+@jax.jit
+def command(terrain, goal):
+    """Speed and steering of a vehicle at (0, 0) that looks east."""
+    at_rest = VehicleState(jnp.array([0.0, 0.0, 0.47]), *jnp.zeros((3, 3)))
+    return CONFIG.command(POLICY(observe(terrain, Chassis(), at_rest, goal, jnp.zeros(2))))
+
+
+def ground(height):
+    x = np.arange(-64.0, 65.0)
+    elevation = height(*np.meshgrid(x, -x)) + np.zeros((129, 129))
+    return terrain_map.build(elevation, np.full((16, 16), GRASS), elevation_range=(-100, 100))
+
+
+FLAT = ground(lambda x, y: 0 * x)
+AHEAD = jnp.array([40.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("bearing", [0.0, 0.2, -0.2, 1.0, -1.0, 3.0, -3.0])
+def test_on_flat_ground_it_steers_to_the_goal(bearing):
+    goal = 40 * jnp.array([jnp.cos(bearing), jnp.sin(bearing), 0.0])
+    chosen = command(FLAT, goal)
+    assert float(chosen.speed) == pytest.approx(POLICY.speed, rel=1e-5)
+    # The arc that turns by the bearing, as far as the wheels turn.
+    aimed = np.clip(
+        np.arctan(bearing / POLICY.turning), -CONFIG.steering_limit, CONFIG.steering_limit
+    )
+    assert float(chosen.steering) == pytest.approx(aimed, abs=0.1)
+    assert np.sign(np.round(chosen.steering, 4)) == np.sign(bearing)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize(
+    "height",
+    [
+        pytest.param(lambda x, y: np.where(y > 1, y - 1, 0) * 0.8, id="bank"),
+        pytest.param(
+            lambda x, y: np.where(y > 1, np.sin(1.5 * x) * np.sin(1.5 * y), 0), id="rough"
+        ),
+    ],
+)
+def test_it_steers_away_from_rough_ground(side, height):
+    terrain = ground(lambda x, y: height(x, side * y))
+    steering = float(command(terrain, AHEAD).steering)
+    assert -side * steering > 0.05
+    mirrored = ground(lambda x, y: height(x, -side * y))
+    assert float(command(mirrored, AHEAD).steering) == pytest.approx(-steering, abs=1e-3)
