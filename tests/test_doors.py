@@ -23,6 +23,7 @@ TINY = """
 ground: {train_worlds: 2, held_out_worlds: 2, starts: 8, pairs: 2}
 navigation: {horizon_seconds: 3, settle_steps: 2}
 simulator: {substeps: 1}
+action_repeat: 2
 ppo:
   {transitions: 256, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1, hidden: [8],
    schedule: constant}
@@ -87,12 +88,13 @@ def test_a_run_leaves_all_that_was_promised(run, folder):
     }  # fmt: skip
     lines = runs.read_metrics(run)
     assert [line["step"] for line in lines] == [1, 2, 3, 4]
-    assert [line["transitions"] for line in lines] == [64, 128, 192, 256]
+    # Steps of the environments, 64 actions an iteration that are held for two of them.
+    assert [line["transitions"] for line in lines] == [128, 256, 384, 512]
     assert all(np.isfinite(line["policy_loss"]) for line in lines)
     assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["2", "4"]
     summary = json.loads((run / "summary.json").read_text())
     for difficulty, rows in summary.items():
-        assert list(rows) == ["ppo", "straight to goal", "random"]
+        assert list(rows) == ["ppo", "look ahead", "straight to goal", "random"]
         assert (run / f"trajectories_{difficulty}.png").is_file()
         assert f"**{difficulty}**" in (run / "summary.md").read_text()
     assert sum(rows["ppo"]["tasks"] for rows in summary.values()) == 4
