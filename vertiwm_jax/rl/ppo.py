@@ -30,7 +30,7 @@ Metrics = dict[str, jax.Array]
 class PPOConfig:
     """Settings of PPO; the defaults suit the navigation task on the built-in simulator."""
 
-    transitions: int = 4_000_000
+    transitions: int = 1_500_000
     """Environment steps of the whole training, rounded up to whole iterations."""
     num_envs: int = 256
     """Environments run side by side."""
