@@ -26,7 +26,8 @@ class ActionRepeat(Environment):
     def step_env(
         self, key: jax.Array, state: Any, action: int | float | jax.Array, params: Any
     ) -> tuple[jax.Array, Any, jax.Array, jax.Array, dict[Any, Any]]:
-        first = self.env.step_env(key, state, action, params)
+        keys = jax.random.split(key, self.times)
+        first = self.env.step_env(keys[0], state, action, params)
 
         def again(result: tuple, key: jax.Array) -> tuple[tuple, None]:
             _, state, reward, terminated, _ = result
@@ -35,7 +36,7 @@ class ActionRepeat(Environment):
             more = (*more[:2], reward + more[2], *more[3:])
             return jax.tree.map(lambda old, new: jnp.where(over, old, new), result, more), None
 
-        return jax.lax.scan(again, first, jax.random.split(key, self.times - 1))[0]
+        return jax.lax.scan(again, first, keys[1:])[0]
 
     def is_truncated(self, state: Any, params: Any) -> jax.Array:
         return self.env.is_truncated(state, params)

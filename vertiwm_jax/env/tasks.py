@@ -76,13 +76,15 @@ def circle_tasks(
         )
     middle = jnp.asarray(terrain.origin + half * np.array([1, -1]), jnp.float32)
     evenly = 2 * jnp.pi * jnp.arange(pairs) / pairs
-    turns = evenly[:, None] + sway * jnp.linspace(-1, 1, _SWAYS if sway else 1)
+    offsets = sway * jnp.linspace(-1, 1, _SWAYS)
+    turns = evenly[:, None] + offsets
 
     def on_circle(angle: jax.Array) -> jax.Array:
         return middle + radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
     def most_level(world: jax.Array) -> jax.Array:
         slopes = slope_around(terrain.select(world), on_circle(turns))
+        slopes = slopes + 1e-3 * jnp.abs(offsets)  # level ground turns nothing
         return jnp.take_along_axis(turns, jnp.argmin(slopes, axis=1)[:, None], axis=1)[:, 0]
 
     world = jnp.arange(terrain.worlds, dtype=jnp.int32)
