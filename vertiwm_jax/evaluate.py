@@ -120,7 +120,8 @@ def _navigate(command: Navigation) -> dict[str, Any]:
     file = run / "config.yaml" if run else configuration.default_config("ppo")
     try:
         config = _adapted(configuration.load(TrainConfig, file), command)
-        terrain = ground.load(command.worlds) if command.worlds else task.held_out(config)
+        grounds, maps = config.ground, command.worlds
+        terrain = ground.load(grounds, maps) if maps else task.held_out(config)
         env, test = task.test_environment(config, terrain)
     except ValueError as error:  # what is wrong with configuration, maps, or tasks on them
         sys.exit(f"error: {error}")

@@ -35,6 +35,8 @@ class GroundConfig:
     """Tasks across the circle of a world."""
     sway: float = 0.25
     """How far, rad, each of them may turn to a more level start; 0 is Verti-Bench's circle."""
+    obstacles: bool = False
+    """Whether the rocks and trees of given maps stand there; without them as in the paper."""
 
 
 def grounds(
@@ -50,7 +52,7 @@ def grounds(
             worlds.generate(jax.random.split(train_key, config.train_worlds), config.training),
             worlds.generate(jax.random.split(test_key, config.held_out_worlds), config.testing),
         )
-    terrain = load(path)
+    terrain = load(config, path)
     if terrain.worlds < config.held_out_every:
         raise ValueError(
             f"{path}: held_out_every: expected at most the {terrain.worlds} worlds found, "
@@ -61,9 +63,10 @@ def grounds(
     return _subset(terrain, ~held_out), _subset(terrain, held_out)
 
 
-def load(path: Path) -> TerrainMap:
+def load(config: GroundConfig, path: Path) -> TerrainMap:
     """The maps of a Verti-Bench checkout or of a folder of `.npz` maps; else `MapError`."""
-    return vertibench.load(path) if (path / "envs").is_dir() else files.load(path)
+    terrain = vertibench.load(path) if (path / "envs").is_dir() else files.load(path)
+    return terrain if config.obstacles else replace(terrain, obstacles=terrain.obstacles[:, :0])
 
 
 def training_tasks(
