@@ -16,6 +16,7 @@ from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.evaluation import prediction, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
 from vertiwm_jax.learning import dataset
+from vertiwm_jax.learning.windows import cut
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
@@ -102,7 +103,7 @@ def _model(name: Model) -> tuple[Dynamics, Params]:
 def _predict(command: Prediction) -> dict[str, Any]:
     try:
         drives, terrain = dataset.load(command.data, command.split)
-        windows = dataset.cut(drives, terrain, command.context, command.horizon, command.stride)
+        windows = cut(drives, terrain, command.context, command.horizon, command.stride)
     except ValueError as error:  # what is wrong with the drives, or with their maps
         sys.exit(f"error: {error}")
     models: dict[str, tuple[Dynamics, Params]] = {

@@ -1,42 +1,15 @@
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
+from learning.recordings import GRASS, SNOW, STEPS, auxiliary, drives, write
 
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.learning.dataset import GROUNDS, DataError
+from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
-
-STEPS, GRASS, SNOW = 40, 3, 9
-
-
-def drives(count: int = 25, steps: int = STEPS) -> dict[str, np.ndarray]:
-    """The arrays of a good file: straight drives; the speed tells the drive."""
-    time = 0.1 * np.arange(steps + 1)
-    state = np.zeros((count, steps + 1, 12), np.float32)
-    state[:, :, 6] = 1 + 0.1 * np.arange(count)[:, None]
-    state[:, :, 0] = state[:, :, 6] * time
-    control = np.zeros((count, steps, 2), np.float32)
-    control[:, :, 0] = state[:, :-1, 6]
-    return {
-        "state": state,
-        "control": control,
-        "length": np.full(count, steps, np.int32),
-        "wheel_class": np.full((count, steps + 1, 4), GRASS, np.uint8),
-        "meta": np.array(json.dumps({"map": "hill.npz"})),
-    }
-
-
-def write(folder: Path, name: str = "a.npz", **changes: np.ndarray | None) -> Path:
-    """A good file with some arrays replaced, or left out, and its map."""
-    arrays = {**drives(), **changes}
-    (folder / "maps").mkdir(exist_ok=True)
-    hill = terrain_map.build(np.ones((9, 9)), np.full((4, 4), GRASS))
-    files.save(hill, folder / "maps" / "hill.npz")
-    np.savez(folder / name, **{k: v for k, v in arrays.items() if v is not None})
-    return folder / name
+from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
+from vertiwm_jax.terrain.map import MapError
 
 
 @pytest.mark.parametrize(
@@ -67,125 +40,6 @@ def test_a_map_beside_the_collection_is_found(tmp_path):
     assert terrain.worlds == 1
 
 
-def test_windows_hold_consecutive_steps_within_the_valid_ones(tmp_path):
-    length = np.full(25, STEPS, np.int32)
-    length[23] = 21
-    write(tmp_path, length=length)
-    loaded, terrain = dataset.load(tmp_path, "test")
-    windows = dataset.cut(loaded, terrain, context=12, horizon=8, stride=5)
-    # (40 - 20) // 5 + 1 of the drives of 40 steps, one of the drive of 21.
-    speeds = np.asarray(windows.state[:, 0, 6])
-    np.testing.assert_allclose(np.unique(speeds, return_counts=True)[0], [3.2, 3.3, 3.4])
-    assert np.unique(speeds, return_counts=True)[1].tolist() == [5, 1, 5]
-    assert windows.state.shape == (11, 21, 12)
-    assert windows.control.shape == (11, 20, 2)
-    assert windows.context == 12
-    driven = np.diff(np.asarray(windows.state[..., 0]), axis=1)
-    np.testing.assert_allclose(driven, np.tile(0.1 * speeds[:, None], 20), atol=1e-5)
-    starts = np.asarray(windows.state[:5, 0, 0]) / (0.1 * 3.2)
-    np.testing.assert_allclose(starts, [0, 5, 10, 15, 20], atol=1e-4)
-
-
-def test_ground_of_a_window_is_that_under_its_predicted_steps(tmp_path):
-    classes = np.full((25, STEPS + 1, 4), GRASS, np.uint8)
-    classes[23] = SNOW
-    classes[24, :11] = SNOW  # Context only.
-    classes[22, 15:, 0] = SNOW
-    write(tmp_path, wheel_class=classes)
-    loaded, terrain = dataset.load(tmp_path, "test")
-    windows = dataset.cut(loaded, terrain, context=12, horizon=8, stride=100)
-    assert [GROUNDS[i] for i in windows.ground] == ["transition", "deformable", "rigid"]
-
-
-def test_drives_shorter_than_a_window_are_refused(tmp_path):
-    write(tmp_path)
-    loaded, terrain = dataset.load(tmp_path, "test")
-    with pytest.raises(DataError, match="at least 60 steps, found at most 40"):
-        dataset.cut(loaded, terrain, context=30, horizon=30)
-
-
-def broken(name: str, place: tuple, value: float) -> np.ndarray:
-    array = drives()[name]
-    array[place] = value
-    return array
-
-
-DEFECTS = {
-    "missing array": ({"state": None}, "missing state"),
-    "missing meta": ({"meta": None}, "missing meta"),
-    "rank of control": ({"control": np.zeros((25, STEPS))}, r"control: expected shape \[K, T, 2\]"),
-    "shape of state": ({"state": np.zeros((25, STEPS, 12))}, r"state: expected shape \[25, 41, 12"),
-    "shape of length": ({"length": np.zeros(24, int)}, r"length: expected shape \[25\]"),
-    "shape of classes": ({"wheel_class": np.zeros((25, 41, 2))}, r"wheel_class: expected shape"),
-    "too long": ({"length": np.full(25, STEPS + 1)}, "length: expected integers in 0 to 40"),
-    "negative length": ({"length": np.full(25, -1)}, "length: expected integers"),
-    "length in seconds": ({"length": np.full(25, 4.0)}, "length: expected integers"),
-    "NaN in a state": ({"state": broken("state", (3, 7, 2), np.nan)}, "state: .*position"),
-    "inf in a control": ({"control": broken("control", (1, 0, 0), np.inf)}, "control: .*speed"),
-    "heading in degrees": ({"state": broken("state", (0, 5, 5), 90.0)}, "state: .*rad"),
-    "steering in degrees": ({"control": broken("control", (0, 5, 1), 15.0)}, "control: .*rad"),
-    "speed in km/h": ({"state": broken("state", (0, 5, 6), 60.0)}, "state: .*m/s"),
-    "rate in degrees": ({"state": broken("state", (0, 5, 11), 45.0)}, "state: .*rad/s"),
-    "position in mm": ({"state": broken("state", (0, 5, 0), 5e5)}, "state: .*position in m"),
-    "unknown class": (
-        {"wheel_class": np.full((25, STEPS + 1, 4), 200, np.uint8)},
-        "wheel_class: expected class ids 0 to 9",
-    ),
-    "class not a number": (
-        {"wheel_class": np.full((25, STEPS + 1, 4), 0.5)},
-        "wheel_class: expected",
-    ),
-    "states not numbers": ({"state": np.full((25, STEPS + 1, 12), "1.0")}, "state: expected numb"),
-    "no drives": (
-        {name: array[:0] for name, array in drives().items() if name != "meta"},
-        "control: expected one drive or more",
-    ),
-    "broken JSON": ({"meta": np.array("{")}, "meta: expected JSON"),
-    "no map in meta": ({"meta": np.array("{}")}, "meta: expected JSON"),
-    "map not a name": ({"meta": np.array('{"map": 3}')}, "meta: expected JSON"),
-    "absent map": ({"meta": np.array('{"map": "x.npz"}')}, "meta: its map x.npz was expected at"),
-    "pickled array": ({"state": np.array([{}], object)}, "expected an .npz archive of plain arr"),
-}
-
-
-@pytest.mark.parametrize("defect", DEFECTS)
-def test_a_defect_is_one_error_that_names_file_and_field(tmp_path, defect):
-    changes, message = DEFECTS[defect]
-    path = write(tmp_path, **changes)
-    with pytest.raises(DataError, match=message) as caught:
-        dataset.load(tmp_path, "test")
-    assert str(caught.value).startswith(f"{path}: ")
-
-
-def test_values_after_the_end_of_a_drive_are_not_looked_at(tmp_path):
-    length = np.full(25, STEPS, np.int32)
-    length[3] = 20
-    write(tmp_path, state=broken("state", (3, 21), np.nan), length=length)
-    dataset.load(tmp_path, "train")
-
-
-@pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04 cut off"])
-def test_a_corrupt_file_is_named(tmp_path, content):
-    (tmp_path / "a.npz").write_bytes(content)
-    with pytest.raises(DataError, match=r"a\.npz: expected an \.npz archive"):
-        dataset.load(tmp_path, "test")
-
-
-def test_a_truncated_file_is_named(tmp_path):
-    path = write(tmp_path)
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(DataError, match=r"a\.npz: expected an \.npz archive"):
-        dataset.load(tmp_path, "test")
-
-
-def test_files_of_unequal_drives_are_refused(tmp_path):
-    write(tmp_path, "a.npz")
-    write(tmp_path, "b.npz", **drives(steps=30))
-    with pytest.raises(DataError, match=r"equally long drives, found \[30, 40\]"):
-        dataset.load(tmp_path, "test")
-
-
 def test_an_empty_folder_and_an_empty_split_are_refused(tmp_path):
     with pytest.raises(DataError, match=r"expected a folder with \.npz files"):
         dataset.load(tmp_path, "test")
@@ -194,3 +48,107 @@ def test_an_empty_folder_and_an_empty_split_are_refused(tmp_path):
         dataset.load(tmp_path, "test")
     loaded, _ = dataset.load(tmp_path, "train")
     assert len(loaded.length) == 3
+
+
+def test_drives_of_unequal_length_are_padded(tmp_path):
+    write(tmp_path, "a.npz", **drives(steps=30), **auxiliary(steps=30))
+    write(tmp_path, "b.npz", **auxiliary())
+    loaded, _ = dataset.load(tmp_path, "test")
+    assert loaded.length.tolist() == [30, 30, 30, STEPS, STEPS, STEPS]
+    assert loaded.state.shape == (6, STEPS + 1, 12)
+    assert loaded.control.shape == (6, STEPS, 2)
+    assert loaded.auxiliary.wheel_force.shape == (6, STEPS + 1, 4, 3)
+    np.testing.assert_array_equal(loaded.state[:3, :31], drives()["state"][22:, :31])
+    np.testing.assert_array_equal(loaded.state[3:], drives()["state"][22:])
+
+
+def test_what_was_recorded_beside_the_states_comes_along(tmp_path):
+    recorded = auxiliary()
+    write(tmp_path, **{name: recorded[name] for name in ("wheel_omega", "chassis_force")})
+    loaded, _ = dataset.load(tmp_path, "validation")
+    np.testing.assert_array_equal(loaded.auxiliary.wheel_omega, recorded["wheel_omega"][20:22])
+    np.testing.assert_array_equal(loaded.auxiliary.chassis_force, recorded["chassis_force"][20:22])
+    assert loaded.auxiliary.wheel_sinkage is None
+    assert loaded.auxiliary.wheel_force is None
+    assert loaded.auxiliary.steer_angle is None
+
+
+def test_half_a_recording_is_refused(tmp_path):
+    write(tmp_path, "a.npz", **auxiliary())
+    path = write(tmp_path, "b.npz", **{**auxiliary(), "wheel_omega": None})
+    with pytest.raises(
+        DataError, match=r"wheel_omega: expected in all files .* missing in 1 of 2"
+    ) as caught:
+        dataset.load(tmp_path, "train")
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_precision_in_the_file_does_not_matter(tmp_path):
+    write(tmp_path, "a.npz", state=drives()["state"].astype(np.float64))
+    write(tmp_path, "b.npz", state=drives()["state"].astype(np.float16))
+    loaded, _ = dataset.load(tmp_path, "train")
+    assert loaded.state.dtype == np.float32
+    np.testing.assert_allclose(loaded.state[:20], loaded.state[20:], rtol=1e-3)
+
+
+def test_missing_classes_are_those_of_the_map_under_the_wheels(tmp_path):
+    # West of x = 0 grass, east of it snow; the vehicle is 3 m long, 1 m wide and heads north-west.
+    wheels = [[1.5, 0.5], [1.5, -0.5], [-1.5, 0.5], [-1.5, -0.5]]
+    meta = np.array(json.dumps({"map": "hill.npz", "vehicle": {"wheels_in_body_xy": wheels}}))
+    state = np.zeros((25, STEPS + 1, 12), np.float32)
+    state[..., 5] = 3 * np.pi / 4
+    state[..., 0] = np.linspace(-2, 2, STEPS + 1)
+    write(tmp_path, state=state, wheel_class=None, meta=meta)
+    semantic = np.where(np.arange(4) < 2, GRASS, SNOW) * np.ones((4, 1), int)
+    files.save(terrain_map.build(np.ones((9, 9)), semantic), tmp_path / "maps" / "hill.npz")
+    loaded, _ = dataset.load(tmp_path, "test")
+    east = state[22:, :, None, 0] - (np.array(wheels) @ [1, 1]) / np.sqrt(2)
+    np.testing.assert_array_equal(loaded.wheel_class, np.where(east < 0, GRASS, SNOW))
+
+
+def test_collections_are_loaded_together(tmp_path):
+    for name, height in (("rigid", 1.0), ("mixed", 2.0)):
+        (tmp_path / name).mkdir()
+        write(tmp_path / name, "a.npz")
+        write(tmp_path / name, "b.npz")
+        hill = terrain_map.build(np.full((9, 9), height), np.full((4, 4), GRASS))
+        files.save(hill, tmp_path / name / "maps" / "hill.npz")
+    loaded, terrain = dataset.load([tmp_path / "rigid", tmp_path / "mixed"], "test")
+    np.testing.assert_array_equal(loaded.world, np.repeat([0, 1, 2, 3], 3))
+    np.testing.assert_array_equal(terrain.elevation[:, 0, 0], [1, 1, 2, 2])
+
+
+def test_collections_of_other_classes_are_refused(tmp_path):
+    for name in ("own", "standard"):
+        (tmp_path / name).mkdir()
+        path = write(tmp_path / name)
+    names = ("moss", *STANDARD.names[1:])
+    classes = GroundClasses(
+        names, STANDARD.rgb, STANDARD.friction, STANDARD.friction_deviation, STANDARD.soils
+    )
+    moss = terrain_map.build(np.ones((9, 9)), np.full((4, 4), GRASS), classes=classes)
+    files.save(moss, tmp_path / "own" / "maps" / "hill.npz")
+    with pytest.raises(MapError, match="class_names: expected") as caught:
+        dataset.load([tmp_path / "own", tmp_path / "standard"], "test")
+    assert str(caught.value).startswith(f"map of {path}: ")
+
+
+def test_every_nth_world_is_held_out_whole(tmp_path):
+    for name in "abcde":
+        write(tmp_path, f"{name}.npz", **auxiliary())
+    loaded, _ = dataset.load(tmp_path, "train")
+    kept, left = dataset.split_worlds(loaded, every=2)
+    np.testing.assert_array_equal(kept.world, np.repeat([0, 2, 4], 20))
+    np.testing.assert_array_equal(left.world, np.repeat([1, 3], 20))
+    assert left.state.shape == (40, STEPS + 1, 12)
+    np.testing.assert_array_equal(left.auxiliary.wheel_omega[:20], auxiliary()["wheel_omega"][:20])
+    assert left.auxiliary.steer_angle.shape[0] == 40
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_a_split_of_worlds_with_an_empty_side_is_refused(tmp_path, every):
+    write(tmp_path, "a.npz")
+    write(tmp_path, "b.npz")
+    loaded, _ = dataset.load(tmp_path, "train")
+    with pytest.raises(DataError, match="worlds or more to hold out"):
+        dataset.split_worlds(loaded, every)

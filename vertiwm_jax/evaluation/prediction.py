@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax.dynamics import Dynamics, Params, rollout, warm_up
-from vertiwm_jax.learning.dataset import GROUNDS, Windows
+from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 

@@ -1,0 +1,108 @@
+"""Prediction windows: where they lie in the drives, and what they hold."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from vertiwm_jax.learning.dataset import Array, Auxiliary, Drives
+from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.terrain.map import TerrainMap
+
+GROUNDS = ("rigid", "deformable", "transition")
+"""Kinds of window, by the ground under the wheels: all rigid, all soil, or both."""
+
+
+@struct.dataclass
+class WindowIndex:
+    """Where N windows of C context steps and K predicted ones lie in the drives.
+
+    drive: `[N]`; start: `[N]` first step of the context; ground: `[N]` index into `GROUNDS`, over
+    the predicted steps; context: C, static; horizon: K, static.
+    """
+
+    drive: jax.Array
+    start: jax.Array
+    ground: jax.Array
+    context: int = struct.field(pytree_node=False)
+    horizon: int = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class Windows:
+    """N windows of C context steps and K predicted ones.
+
+    state: `[N, C + K + 1, 12]`; control: `[N, C + K, 2]`; world: `[N]`;
+    ground: `[N]` index into `GROUNDS`, over the predicted steps; context: C, static;
+    auxiliary: leaves `[N, C + K + 1, ...]`, those that the drives have.
+    """
+
+    state: jax.Array
+    control: jax.Array
+    world: jax.Array
+    ground: jax.Array
+    context: int = struct.field(pytree_node=False)
+    auxiliary: Auxiliary = Auxiliary()
+
+
+def index(
+    drives: Drives, terrain: TerrainMap, context: int = 16, horizon: int = 16, stride: int = 4
+) -> WindowIndex:
+    """All windows of `context` recorded and `horizon` predicted steps, every `stride` steps.
+
+    `DataError` when no drive is long enough.
+    """
+    length = np.asarray(drives.length)
+    places = [
+        (drive, start)
+        for drive, steps in enumerate(length)
+        for start in range(0, int(steps) - context - horizon + 1, stride)
+    ]
+    if not places:
+        raise DataError(
+            f"expected drives of at least {context + horizon} steps, "
+            f"found at most {int(length.max())}"
+        )
+    drive, start = np.array(places, np.int32).T
+    steps = start[:, None] + context + np.arange(horizon + 1)
+    soft = np.asarray(terrain.deformable)[np.asarray(drives.wheel_class)]
+    share = soft.mean(axis=-1)[drive[:, None], steps].mean(axis=-1)
+    ground = np.where(share == 0, 0, np.where(share == 1, 1, 2))
+    return WindowIndex(
+        drive=jnp.asarray(drive),
+        start=jnp.asarray(start),
+        ground=jnp.asarray(ground, jnp.int32),
+        context=context,
+        horizon=horizon,
+    )
+
+
+@jax.jit
+def gather(drives: Drives, index: WindowIndex) -> Windows:
+    """The windows at `index`, all or a batch of them; copies only those.
+
+    Pass drives that lie on the device (`jax.device_put`) when this is called more than once. A
+    batch is `jax.tree.map(lambda x: x[rows], index)`.
+    """
+    steps = index.start[:, None] + jnp.arange(index.context + index.horizon + 1)
+
+    def cut_out(array: Array, steps: jax.Array) -> jax.Array:
+        return jnp.asarray(array).at[index.drive[:, None], steps].get(mode="promise_in_bounds")
+
+    return Windows(
+        state=cut_out(drives.state, steps),
+        control=cut_out(drives.control, steps[:, :-1]),
+        world=jnp.asarray(drives.world)[index.drive],
+        ground=index.ground,
+        context=index.context,
+        auxiliary=jax.tree.map(partial(cut_out, steps=steps), drives.auxiliary),
+    )
+
+
+def cut(
+    drives: Drives, terrain: TerrainMap, context: int = 16, horizon: int = 16, stride: int = 4
+) -> Windows:
+    """All windows at once: `gather` of `index`."""
+    return gather(drives, index(drives, terrain, context, horizon, stride))
