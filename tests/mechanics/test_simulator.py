@@ -210,7 +210,7 @@ def test_sinks_deeper_into_weaker_soil():
         driven = drive(soil, at_rest(soil))
         assert loads(driven)[-1].sum() == pytest.approx(WEIGHT, rel=0.01)
         depths.append(driven.history.sinkage[-1].mean())
-    assert 0 < depths[0] < depths[1] < depths[2] < 0.25
+    assert 0 < depths[0] < depths[1] < depths[2] < 0.3
 
 
 def test_soil_slows_a_vehicle_down():

@@ -22,6 +22,7 @@ from vertiwm_jax.mechanics.newton_euler import (
     turned,
     velocity_at,
 )
+from vertiwm_jax.mechanics.scm import ScmContact, scm_forces
 from vertiwm_jax.mechanics.touch import Touch, touch
 from vertiwm_jax.mechanics.vector import Axes, Vector
 from vertiwm_jax.mechanics.vehicle import Vehicle
@@ -36,7 +37,7 @@ ADHESION_SPEED = 0.1
 SPIN_FLOOR = 0.5
 """Wheel speed, rad/s, below which a locked brake lets a wheel creep."""
 QUADRATURE_NODES = 4
-"""On each side of the stress peak."""
+"""In each piece of a wheel's contact."""
 LEAST_SINKAGE = 1e-3
 """Sinkage, m, below which soil counts as linear."""
 LARGEST_LOAD = 2.5
@@ -50,8 +51,6 @@ HULL_LOAD = 10.0
 """Largest force on the hull, in vehicle weights."""
 HULL_DEPTH = 0.1
 """Depth, m, beyond which the hull is pushed out no faster: what is deep in comes out slowly."""
-HULL_SOIL = 0.2
-"""Depth, m, that soil gives way under the belly before it carries."""
 CLIMB_SPEED = 2.0
 """Speed, m/s, at which a wheel that finds itself in the ground is lifted out of it."""
 CREEP_SPEED = 0.01
@@ -60,36 +59,26 @@ CREEP_SPEED = 0.01
 
 @struct.dataclass
 class SimulatorParams:
-    """vehicle; contact: of wheels in soil.
+    """vehicle; contact: of wheels in soil, whose type chooses between Wong's wheel and SCM.
 
-    stiffening: `[]` factor on Bekker's moduli of the map's soils; shear_scale: `[]` factor on
-    their shear modulus K. 1 is the soil of the equations.
-    upright_stress: `[]` share of the soil's normal stress that acts along the ground's normal
-    instead of the rim's: it then resists the wheel's spin and not its motion. 0 is Wong's wheel.
+    stiffening: `[]` factor on Bekker's moduli of the map's soils; 1 is the soil of the equations.
     """
 
     vehicle: Vehicle
-    contact: Contact
+    contact: Contact | ScmContact
     stiffening: jax.Array
-    shear_scale: jax.Array
-    upright_stress: jax.Array
 
 
 def chrono_like(vehicle: Vehicle) -> SimulatorParams:
-    """Soil contact fitted to Chrono's SCM, on the training drives of an HMMWV.
+    """Chrono's soil contact model, fitted to the training drives of an HMMWV.
 
-    SCM soil carries more than Bekker's equation under a wheel (pushed-up soil and penetration
-    speed add to it), its normal stress acts along the normal of the ground, and its shear
-    displacement is a path length that never resets, so friction is mobilised early.
+    Columns under a wheel that bounces carry more than under a steady one, and what 0.1 s see of
+    its friction is spread over more slip.
     """
     return SimulatorParams(
         vehicle=jax.tree.map(jnp.asarray, vehicle),
-        contact=Contact(
-            peak=0.0, peak_slip=0.04, exit=-0.47, unload_stiffness=6e5, creep_speed=ADHESION_SPEED
-        ),
-        stiffening=jnp.float32(1.34),
-        shear_scale=jnp.float32(0.8),
-        upright_stress=jnp.float32(0.61),
+        contact=ScmContact(*map(jnp.float32, (3e4, 0.75, 0.4))),
+        stiffening=jnp.float32(1.8),
     )
 
 
@@ -301,16 +290,11 @@ def _support(
     vehicle, soil = params.vehicle, _scaled(params, wheels.soil)
     wheel = Wheel(vehicle.wheel_radius, vehicle.wheel_width)
     spin = history.wheel_speed
-    in_soil = forces(
-        wheel, soil, params.contact, history.sinkage, ahead, drift, spin, rut, QUADRATURE_NODES
-    )
-    # Compaction resistance is what shear gives the axle and the hub does not get.
-    moved = params.upright_stress * (in_soil.torque / wheel.radius - in_soil.longitudinal)
-    in_soil = replace(
-        in_soil,
-        longitudinal=in_soil.longitudinal + moved,
-        torque=in_soil.torque + wheel.radius * moved,
-    )
+    contact, motion = params.contact, (history.sinkage, ahead, drift, spin, rut)
+    if isinstance(contact, ScmContact):
+        in_soil = scm_forces(wheel, soil, contact, *motion, QUADRATURE_NODES)
+    else:
+        in_soil = forces(wheel, soil, contact, *motion, QUADRATURE_NODES)
     # Normal force grows about like sinkage to the power n + 1/2 (Bekker, wheel on flat ground).
     sunk = jnp.maximum(history.sinkage - rut, LEAST_SINKAGE)
     yielding = (soil.n + 0.5) * in_soil.normal / sunk
@@ -334,7 +318,6 @@ def _scaled(params: SimulatorParams, soil: Soil) -> Soil:
         soil,
         kc=params.stiffening * soil.kc,
         kphi=params.stiffening * soil.kphi,
-        shear_modulus=params.shear_scale * soil.shear_modulus,
     )
 
 
@@ -365,17 +348,17 @@ def _hull_contact(
 ) -> list[ContactForce]:
     """The chassis on the ground: a heavily damped spring, and friction.
 
-    Soil gives way under the belly for a while: Chrono's SCM feels wheels only.
+    Soil gives way under the belly, as Chrono's SCM feels wheels only, but not under a roof.
     """
     arm, n = hull.point.plus(centre, -1.0), hull.normal
     forward, left = _tangents(n, jnp.ones(1), jnp.zeros(1))
     velocity = velocity_at(twist, arm)
     stiffness = 2 * vehicle.mass / HULL_SECONDS**2
     rate = stiffness * (seconds + HULL_SECONDS)
-    depth = hull.depth - jnp.where(hull.soft & (n.z > LEAST_UPRIGHT), HULL_SOIL, 0.0)
-    load = stiffness * jnp.minimum(depth, HULL_DEPTH) - rate * velocity.dot(n)
+    gives_way = hull.soft & (n.z > LEAST_UPRIGHT)
+    load = stiffness * jnp.minimum(hull.depth, HULL_DEPTH) - rate * velocity.dot(n)
     load = jnp.minimum(load, HULL_LOAD * vehicle.mass * GRAVITY)
-    pressing = (depth > 0) & (load > 0)
+    pressing = (hull.depth > 0) & ~gives_way & (load > 0)
     load, rate = jnp.where(pressing, load, 0.0), jnp.where(pressing, rate, 0.0)
     ahead, drift = velocity.dot(forward), velocity.dot(left)
     grip = HULL_FRICTION * load * jax.lax.rsqrt(ahead**2 + drift**2 + ADHESION_SPEED**2)

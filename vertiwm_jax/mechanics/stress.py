@@ -131,7 +131,7 @@ def motion(
 def patch(contact: Contact, friction_angle: jax.Array, depth: jax.Array, m: Motion) -> Patch:
     """Where a wheel touches soil at `depth`, in wheel radii."""
     driven, braked = jnp.maximum(m.slip, 0.0), jnp.maximum(-m.slip, 0.0)
-    entry = _contact_angle(depth)
+    entry = contact_angle(depth)
     peak = (contact.peak + contact.peak_slip * driven) * entry
     reversal = (1 - braked / 2) * entry
     if contact.reversal == "rankine":
@@ -143,12 +143,12 @@ def patch(contact: Contact, friction_angle: jax.Array, depth: jax.Array, m: Moti
         reversal = jnp.where(skid, jnp.minimum(towed, _MAX_PEAK * entry), entry)
         peak = jnp.where(skid, reversal, peak)
     peak = jnp.minimum(peak, _MAX_PEAK * entry)
-    rebound = _contact_angle(contact.rebound * depth)
+    rebound = contact_angle(contact.rebound * depth)
     leave = (contact.exit + contact.exit_slip * driven) * entry - rebound
     return Patch(entry, peak, jnp.minimum(leave, peak), reversal)
 
 
-def _contact_angle(depth: jax.Array) -> jax.Array:
+def contact_angle(depth: jax.Array) -> jax.Array:
     """acos(1 - depth) without its cancellation; zero, with zero slope, at depth <= 0."""
     positive = depth > 0
     half = jnp.sqrt(jnp.where(positive, depth, 1.0) / 2)
@@ -166,7 +166,7 @@ def breaks(p: Patch, m: Motion) -> tuple[jax.Array, ...]:
     skid = m.slip < 0
     ratio = jnp.clip(jnp.where(skid, m.rim / jnp.where(skid, m.hub, 1.0), 0.5), -0.999, 0.999)
     still_rear = jnp.clip(jnp.arccos(ratio), p.exit, p.reversal)
-    still_front = jnp.clip(_contact_angle(1 - mean), p.reversal, p.entry)
+    still_front = jnp.clip(contact_angle(1 - mean), p.reversal, p.entry)
     low, middle, high = (jnp.where(skid, x, p.peak) for x in (still_rear, p.reversal, still_front))
     return (
         p.exit,
@@ -187,7 +187,7 @@ def _mean_cosine(p: Patch) -> jax.Array:
 
 def arc(p: Patch, angle: jax.Array) -> Arc:
     """The point of the rim at `angle` rad."""
-    sin_a, cos_a = _sin_cos((p.entry - angle) / 2)
+    sin_a, cos_a = sin_cos((p.entry - angle) / 2)
     sin_entry, cos_entry = jnp.sin(p.entry), jnp.cos(p.entry)
     return Arc(
         angle,
@@ -203,11 +203,11 @@ def pressing_depth(p: Patch, angle: jax.Array) -> jax.Array:
     scale = jnp.where(some, (p.entry - p.peak) / jnp.where(some, behind, 1.0), 0.0)
     from_entry = jnp.where(angle < p.peak, (angle - p.exit) * scale, p.entry - angle)
     # Half angles, because the difference of two cosines is lost in rounding near the entry.
-    sin_a, cos_a = _sin_cos(from_entry / 2)
+    sin_a, cos_a = sin_cos(from_entry / 2)
     return 2 * sin_a * (jnp.sin(p.entry) * cos_a - jnp.cos(p.entry) * sin_a)
 
 
-def _sin_cos(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+def sin_cos(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Sine and cosine for |x| < 2.1, to float32: the library's would take most of the time."""
     y = x * x
     sin = x * _horner(y, 1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)

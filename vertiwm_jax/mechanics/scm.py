@@ -1,0 +1,132 @@
+"""Forces on a wheel in the soil contact model (SCM) of Chrono.
+
+The ground is a field of columns. Each is pressed down under Bekker's stress and sheared under
+Janosi and Hanamoto's, as under Wong's wheel, but stress acts along the normal of the undisturbed
+ground and shear in its plane: compaction resists the spin of a wheel and not its motion, and a
+wheel that rolls pushes the soil ahead of its hub forwards.
+
+Sources: Krenn and Hirzinger, "SCM, a soil contact model for planetary rover mobility analysis"
+(2009); Tasora et al., "A deformable terrain model in multi-domain dynamics using elastoplastic
+constraints" (2019); SCMTerrain of Chrono 9.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from vertiwm_jax.mechanics.stress import Scalar, Wheel, contact_angle, sin_cos
+from vertiwm_jax.mechanics.wheel import MAX_SINKAGE, WheelForces
+from vertiwm_jax.terrain.soil import Soil
+
+Arrays = tuple[jax.Array, ...]
+
+_MIN_SINKAGE = 1e-6  # in wheel radii; below it the wheel is airborne
+_SHORTEST = 0.02  # m, of a contact whose length enters Bekker's equation
+
+
+@struct.dataclass
+class ScmContact:
+    """Coefficients `[...]` beside those of the soil.
+
+    damping: Pa s/m by which a rim that moves downwards raises the pressure.
+    resistance: share of the moment of that pressure about the axle, all of it ahead of the hub,
+        that soil springing back behind the hub leaves over.
+    creep_speed: m/s of slip at which shear reaches 71 % of its strength.
+    """
+
+    damping: Scalar = 3e4
+    resistance: Scalar = 1.0
+    creep_speed: Scalar = 0.1
+
+
+def scm_forces(
+    wheel: Wheel,
+    soil: Soil,
+    contact: ScmContact,
+    sinkage: Scalar,
+    velocity_x: Scalar,
+    velocity_y: Scalar,
+    omega: Scalar,
+    rut: Scalar = 0.0,
+    nodes: int = 6,
+) -> WheelForces:
+    """Forces on a wheel at a given sinkage, all `[...]`; arguments as those of `wheel.forces`.
+
+    nodes: Gauss-Legendre nodes in each of two pieces of the contact: where the rim pushes the
+        soil ahead, and where it drags it back.
+    """
+    arguments = (wheel, soil, contact, sinkage, velocity_x, velocity_y, omega, rut)
+    arguments = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), arguments)
+    shape = jnp.broadcast_shapes(*(x.shape for x in jax.tree.leaves(arguments)))
+    wheel, soil, contact, sinkage, velocity_x, velocity_y, omega, rut = arguments
+
+    # Seen along the travel, so that the soil is always entered ahead.
+    both = velocity_x + wheel.radius * omega
+    ahead = jnp.where(both >= 0, 1.0, -1.0)
+    hub, rim = ahead * velocity_x, ahead * wheel.radius * omega
+    creep = contact.creep_speed
+    rolling = jnp.abs(both) * jax.lax.rsqrt(both**2 + creep**2)
+
+    depth = jnp.clip((sinkage - rut) / wheel.radius, 0.0, MAX_SINKAGE)
+    touching = depth > _MIN_SINKAGE
+    entry = contact_angle(jnp.where(touching, depth, _MIN_SINKAGE))
+    sin_entry, cos_entry = jnp.sin(entry), jnp.cos(entry)
+    length = jnp.maximum(wheel.radius * sin_entry, _SHORTEST)
+    keq = soil.kc * (1 / wheel.width + 1 / length) + soil.kphi
+
+    # The rim drags the soil back as far as rim cos(angle) > hub.
+    overtaken = jnp.clip(hub / jnp.where(rim > creep / 100, rim, creep / 100), 0.0, 1.0)
+    turn = jnp.minimum(contact_angle(1 - overtaken), entry)
+
+    def slipped(angle: jax.Array, sin: jax.Array, cos: jax.Array) -> jax.Array:
+        """Slip summed over the ground from the hub to `angle`, times hub speed over radius."""
+        return rim * (angle + sin * cos) / 2 - hub * sin
+
+    at_entry = slipped(entry, sin_entry, cos_entry)
+    at_turn = slipped(turn, jnp.sin(turn), jnp.cos(turn))
+    speed = jnp.sqrt(hub**2 + creep**2)
+
+    @partial(jax.checkpoint, prevent_cse=False)
+    def add_node(total: Arrays, node: tuple[jax.Array, ...]) -> tuple[Arrays, None]:
+        """Adds a point of the rim to the stress along, across, upwards and about the axle."""
+        pushed, point, weight = node
+        start, stop = jnp.where(pushed, turn, 0.0), jnp.where(pushed, entry, turn)
+        angle = start + point * (stop - start)
+        sin, cos = sin_cos(angle)
+        z = jnp.maximum(wheel.radius * (cos - cos_entry) + rut, 1e-9)
+        sigma = keq * jnp.exp(soil.n * jnp.log(z)) + contact.damping * jnp.maximum(rim, 0.0) * sin
+        # The path of the soil since it met the wheel, there and back. What lies in a rut has
+        # been sheared before, about as far as it was pressed.
+        here = slipped(angle, sin, cos)
+        path = jnp.where(pushed, here - at_entry, 2 * at_turn - at_entry - here)
+        side = velocity_y * (sin_entry - sin)
+        path = jnp.sqrt(path**2 + side**2 + (1e-3 * creep) ** 2) * wheel.radius / speed + rut
+        along, across = rim * cos - hub, -velocity_y
+        strength = soil.cohesion + sigma * jnp.tan(soil.friction_angle)
+        tau = strength * (1 - jnp.exp(-path / soil.shear_modulus))
+        tau = tau * jax.lax.rsqrt(along**2 + across**2 + creep**2)
+        moment = tau * along * cos + contact.resistance * rolling * sigma * sin
+        weight = weight * (stop - start) * cos
+        stresses = (tau * along, tau * across, sigma, moment)
+        return tuple(t + weight * s for t, s in zip(total, stresses, strict=True)), None
+
+    # A loop over nodes, for the reason given at `wheel.forces`.
+    total, _ = jax.lax.scan(add_node, (jnp.zeros(shape),) * 4, _quadrature(nodes))
+    longitudinal, lateral, normal, torque = (jnp.where(touching, t, 0.0) for t in total)
+    area = wheel.radius * wheel.width
+    return WheelForces(
+        longitudinal=ahead * area * longitudinal,
+        lateral=area * lateral,
+        normal=area * normal,
+        torque=ahead * area * wheel.radius * torque,
+    )
+
+
+def _quadrature(nodes: int) -> tuple[jax.Array, ...]:
+    """Whether pushed ahead, Gauss-Legendre point and weight on [0, 1] of every node `[2 nodes]`."""
+    x, w = np.polynomial.legendre.leggauss(nodes)
+    points, weights = (np.tile(y, 2).astype(np.float32) for y in ((x + 1) / 2, w / 2))
+    return jnp.arange(2 * nodes) >= nodes, jnp.asarray(points), jnp.asarray(weights)
