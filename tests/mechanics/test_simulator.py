@@ -18,6 +18,7 @@ from vertiwm_jax.mechanics.simulator import (
     chrono_like,
 )
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.wheel import Contact
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.map import TerrainMap
@@ -219,6 +220,18 @@ def test_soil_slows_a_vehicle_down():
         terrain = ground(kind=kind)
         speeds.append(drive(terrain, at_rest(terrain, x=-10), 3.0).state.velocity[-1, 0])
     assert speeds[0] > speeds[1] > speeds[2] > 1.5
+
+
+@pytest.mark.parametrize("kind", [SAND, MUD, SNOW])
+def test_wongs_wheel_also_stands_and_drives_on_soil(kind):
+    wong, soil = replace(PARAMS, contact=Contact()), ground(kind=kind)
+    standing = drive(soil, at_rest(soil), params=wong)
+    assert loads(standing)[-1].sum() == pytest.approx(WEIGHT, rel=0.01)
+    assert standing.history.sinkage[-1].min() > 0
+    driven = drive(soil, at_rest(soil, x=-10), 3.0, params=wong)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((standing, driven)))
+    # In this snow compaction resists the wheels more than shear can pull.
+    assert (driven.state.velocity[-1, 0] > 2.5) == (kind != SNOW)
 
 
 def test_left_and_right_are_the_same():

@@ -56,7 +56,8 @@ def scm_forces(
     """Forces on a wheel at a given sinkage, all `[...]`; arguments as those of `wheel.forces`.
 
     nodes: Gauss-Legendre nodes in each of two pieces of the contact: where the rim pushes the
-        soil ahead, and where it drags it back.
+        soil ahead, and where it drags it back; 6 are within 0.4 % of the load (99 % of random
+        wheels), 4 within 1 %.
     """
     arguments = (wheel, soil, contact, sinkage, velocity_x, velocity_y, omega, rut)
     arguments = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), arguments)
@@ -72,7 +73,9 @@ def scm_forces(
 
     depth = jnp.clip((sinkage - rut) / wheel.radius, 0.0, MAX_SINKAGE)
     touching = depth > _MIN_SINKAGE
-    entry = contact_angle(jnp.where(touching, depth, _MIN_SINKAGE))
+    depth = jnp.where(touching, depth, _MIN_SINKAGE)
+    # Ground is pressed from above: by the lower half of a wheel, also of one sunk beyond its hub.
+    entry = jnp.minimum(contact_angle(depth), jnp.pi / 2)
     sin_entry, cos_entry = jnp.sin(entry), jnp.cos(entry)
     length = jnp.maximum(wheel.radius * sin_entry, _SHORTEST)
     keq = soil.kc * (1 / wheel.width + 1 / length) + soil.kphi
@@ -96,7 +99,7 @@ def scm_forces(
         start, stop = jnp.where(pushed, turn, 0.0), jnp.where(pushed, entry, turn)
         angle = start + point * (stop - start)
         sin, cos = sin_cos(angle)
-        z = jnp.maximum(wheel.radius * (cos - cos_entry) + rut, 1e-9)
+        z = jnp.maximum(wheel.radius * (cos - 1 + depth) + rut, 1e-9)
         sigma = keq * jnp.exp(soil.n * jnp.log(z)) + contact.damping * jnp.maximum(rim, 0.0) * sin
         # The path of the soil since it met the wheel, there and back. What lies in a rut has
         # been sheared before, about as far as it was pressed.
