@@ -14,13 +14,15 @@ import numpy as np
 from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
-from vertiwm_jax.env.repeat import ActionRepeat
+from vertiwm_jax.env.observation import ARCS
+from vertiwm_jax.env.repeat import ActionRepeat, Controller
 from vertiwm_jax.evaluation import plots, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
 from vertiwm_jax.evaluation.navigation import Policy
 from vertiwm_jax.evaluation.report import Results, drive
 from vertiwm_jax.rl import task
 from vertiwm_jax.rl.checkpoints import CheckpointError
+from vertiwm_jax.rl.learned import Corrected
 from vertiwm_jax.rl.loop import LoopConfig, TrainingError, TrainingInterrupted, restore, train
 from vertiwm_jax.rl.ppo import PPO, PPOConfig, TrainState
 from vertiwm_jax.rl.task import TaskConfig
@@ -52,7 +54,7 @@ class TrainConfig(TaskConfig):
     action_repeat: int = 4
     """Steps of 0.1 s that an action is held while learning; ppo.transitions counts actions."""
     base: Literal["look ahead", "straight to goal", "none"] = "look ahead"
-    """The controller that the policy learns to correct."""
+    """The controller that the policy learns to correct; it acts at every step."""
     ppo: PPOConfig = PPOConfig()
     """The algorithm."""
     loop: LoopConfig = LoopConfig()
@@ -94,16 +96,21 @@ def _configuration(argv: Sequence[str] | None) -> TrainConfig:
 
 def algorithm(config: TrainConfig, env: NavigationEnv) -> PPO:
     """PPO on the task as the configuration has it."""
-    base = None if config.base == "none" else baselines(config.navigation)[config.base]
-    return PPO(ActionRepeat(env, config.action_repeat), config.ppo, task.outcomes, base)
+    repeated = ActionRepeat(env, config.action_repeat, _base(config))
+    return PPO(repeated, config.ppo, task.outcomes, ARCS)
+
+
+def _base(config: TrainConfig) -> Controller | None:
+    return None if config.base == "none" else baselines(config.navigation)[config.base]
 
 
 def _policies(config: TrainConfig, ppo: PPO, params: NavigationParams, state: TrainState) -> Rows:
-    names = [f"ppo, seed {seed}" for seed in range(config.loop.seeds)]
-    return {
-        name: ppo.policy(params, jax.tree.map(lambda x, seed=seed: x[seed], state))
-        for seed, name in enumerate(names if len(names) > 1 else ["ppo"])
-    }
+    base, rows = _base(config), {}
+    for seed in range(config.loop.seeds):
+        learned = ppo.policy(params, jax.tree.map(lambda x, seed=seed: x[seed], state))
+        name = f"ppo, seed {seed}" if config.loop.seeds > 1 else "ppo"
+        rows[name] = Corrected(base, learned) if base else learned
+    return rows
 
 
 def _train_and_report(config: TrainConfig) -> Path:

@@ -188,3 +188,29 @@ def test_gradients_are_finite_at_the_goal():
         return observation.observe(terrain, CHASSIS, moved, state.position, jnp.zeros(2)).sum()
 
     assert jnp.isfinite(jax.jit(jax.grad(total))(state.position)).all()
+
+
+def test_each_arc_is_a_candidate_and_nothing_seen_is_lost():
+    seen = jnp.arange(observation.OBSERVATION_SIZE, dtype=jnp.float32)
+    arcs, rest = observation.ARCS.split(seen)
+    assert arcs.shape == (9, 41) and len(observation.ARCS.actions) == 9
+    np.testing.assert_allclose(arcs[:, -1], observation.ARC_STEERING)
+    np.testing.assert_allclose([speed for speed, _ in observation.ARCS.actions], 0.0)
+    np.testing.assert_allclose(
+        [steering for _, steering in observation.ARCS.actions], observation.ARC_STEERING
+    )
+    entries = np.concatenate([np.ravel(arcs[:, :-1]), rest])
+    np.testing.assert_array_equal(np.sort(entries), seen)
+    heights = observation.arcs_ahead(seen)[0]
+    np.testing.assert_array_equal(arcs[:, :8], heights)
+
+
+def test_the_edge_of_the_map_is_a_wall():
+    terrain = world()
+    edge = float(terrain.origin[0] + 128 * terrain.resolution)
+    state = vehicle(edge - 5.0, 0.0, 0.0)
+    found = observe(terrain, CHASSIS, state, jnp.zeros(3), jnp.zeros(2))
+    crown = np.ravel(observation.arcs_ahead(found)[1])
+    outside = observation.poses_ahead(CHASSIS)[0][1:, 0] > 5.0
+    np.testing.assert_allclose(crown[outside], 3.0, rtol=1e-6)
+    assert np.all(crown[~outside] < 2.0) and 0 < outside.sum() < outside.size

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from vertiwm_jax.networks.policy import LOG_STD_BOUNDS, Actor, Critic, Gaussian
+from vertiwm_jax.networks.policy import LOG_STD_BOUNDS, Actor, Candidates, Critic, Gaussian
 
 RNG = np.random.default_rng(0)
 MEAN = RNG.normal(size=(5, 3)).astype(np.float32)
@@ -59,3 +59,53 @@ def test_critic_gives_one_value_for_each_observation():
     critic = Critic(hidden=(8,))
     observation = jnp.ones((3, 4, 5))
     assert critic.apply(critic.init(jax.random.key(0), observation), observation).shape == (3, 4)
+
+
+def chosen_from(order):
+    """Three candidates of two features each, and four other numbers, in this order."""
+
+    def split(observation):
+        seen = observation[..., :6].reshape(*observation.shape[:-1], 3, 2)
+        return seen[..., jnp.array(order), :], observation[..., 6:]
+
+    actions = ((0.0, -1.0), (0.5, 0.0), (0.0, 1.0))
+    return Candidates(split, tuple(actions[i] for i in order))
+
+
+def trained(network):
+    """Weights of a network for 10 numbers, far from what they start as."""
+    params = network.init(jax.random.key(0), jnp.zeros(10))
+    leaves, structure = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    noisy = [x + jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
+    return jax.tree.unflatten(structure, noisy)
+
+
+def test_candidates_are_alike_whatever_their_order():
+    observation = jax.random.normal(jax.random.key(2), (64, 10))
+    orders = (0, 1, 2), (2, 0, 1)
+    actors = [Actor(2, (16, 16), -1.0, chosen_from(order)) for order in orders]
+    critics = [Critic((16, 16), chosen_from(order)) for order in orders]
+    for first, second in (actors, critics):
+        params = trained(first)
+        found = [jax.tree.leaves(n.apply(params, observation))[0] for n in (first, second)]
+        np.testing.assert_allclose(*found, rtol=2e-5, atol=2e-5)
+        assert float(jnp.std(found[0])) > 0.1
+
+
+def test_the_action_of_the_candidate_attended_to_is_taken():
+    actor = Actor(2, (16, 16), -1.0, chosen_from((0, 1, 2)))
+    params = actor.init(jax.random.key(0), jnp.zeros(10))
+    layers = params["params"]
+    attention = dict(layers["Attention_0"])
+    # A score that grows with the first feature of a candidate, and nothing else.
+    pick = jnp.zeros((16, 16)).at[0, 0].set(5.0)
+    attention["Dense_0"] = {"kernel": jnp.zeros((4, 16))}
+    attention["Dense_1"] = {"kernel": pick[:2], "bias": jnp.zeros(16)}
+    attention["Dense_2"] = {"kernel": pick, "bias": jnp.zeros(16)}
+    attention["Dense_3"] = {"kernel": 40 * pick[:, :1], "bias": jnp.zeros(1)}
+    nothing = jax.tree.map(jnp.zeros_like, layers["MLP_0"])
+    params = {"params": {**layers, "Attention_0": attention, "MLP_0": nothing}}
+    seen = jnp.array([[-1.0, 0, 1, 0, -1, 0], [-1, 0, -1, 0, 1, 0]])
+    mean = actor.apply(params, jnp.concatenate([seen, jnp.zeros((2, 4))], -1)).mean
+    np.testing.assert_allclose(mean, [[0.5, 0.0], [0.0, 1.0]], atol=1e-4)

@@ -45,6 +45,9 @@ class Probe(environment.Environment):
         state = ProbeState(time=jnp.zeros((), jnp.int32), observation=observation)
         return observation[None], state
 
+    def observe(self, key, state, action, params):
+        return state.observation[None]
+
     def is_terminated(self, state, params):
         return jnp.array(False) if self.steps is None else state.time >= self.steps
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.termination import edge_distance
+from vertiwm_jax.networks.policy import Candidates
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -29,6 +30,7 @@ _SLOPE_SCALE = 0.4
 _TWIST_SCALE = 0.2
 _CROWN_SCALE = 0.2  # m
 _SINKAGE_SCALE = 0.1  # m
+_WALL = 0.6  # m, crown that stands for the edge of the map
 
 GOAL = slice(8, 11)
 """Where the observation holds the distance over 50 m and the cosine and sine of the bearing."""
@@ -66,6 +68,19 @@ def arcs_ahead(observation: jax.Array) -> tuple[jax.Array, ...]:
     return tuple(jnp.moveaxis(ahead, -3, 0))
 
 
+def _split(observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What is seen on each arc `[..., 9, 41]`, its steering included, and all the rest."""
+    ahead = jnp.concatenate(arcs_ahead(observation), axis=-1)
+    steering = jnp.broadcast_to(ARC_STEERING.astype(np.float32), ahead.shape[:-1])
+    here = observation[..., GROUND][..., ::_POSES]
+    rest = (observation[..., : GROUND.start], here, observation[..., GROUND.stop :])
+    return jnp.concatenate([ahead, steering[..., None]], -1), jnp.concatenate(rest, -1)
+
+
+ARCS = Candidates(_split, tuple((0.0, float(steering)) for steering in ARC_STEERING))
+"""The arcs as candidates of a policy: each stands for its steering."""
+
+
 def poses_ahead(chassis: Chassis) -> tuple[np.ndarray, np.ndarray]:
     """Poses on the arcs, in the yaw frame: x, y in m `[P, 2]` and heading in rad `[P]`."""
     curvature = np.tan(_LARGEST_STEERING * ARC_STEERING)[:, None] / chassis.wheelbase
@@ -90,8 +105,8 @@ def observe(
     In order: roll, pitch; v_body; omega_body; distance to the goal, cosine and sine of its
     bearing; the last action; what the ground would do to the vehicle here and at places on nine
     arcs up to six wheelbases long, obstacles included (mean height under the wheels against now;
-    crown between them, which the belly meets; rise; bank; twist, which lifts wheels); friction
-    and plate sinkage at some of the places, -1 off the map.
+    crown between them, which the belly meets, with a wall beyond the edge of the map; rise; bank;
+    twist, which lifts wheels); friction and plate sinkage at some of the places, -1 off the map.
 
     goal: `[3]` m; action: `[2]` in [-1, 1].
     """
@@ -120,9 +135,11 @@ def observe(
     xy = at(np.stack([place, *(place + corner for corner in corners)]))
     middle, fl, fr, rl, rr = query.height(terrain, xy) + obstacles.height_above_ground(terrain, xy)
     mean = (fl + fr + rl + rr) / 4
+    # Heights repeat beyond the edge of the map, which would look like the best of roads.
+    crown = jnp.where(edge_distance(terrain, at(place)) >= 0, middle - mean, _WALL)
     ground = (
         (mean - state.position[2]) / _HEIGHT_SCALE,
-        (middle - mean) / _CROWN_SCALE,
+        crown / _CROWN_SCALE,
         (fl + fr - rl - rr) / (2 * chassis.wheelbase * _SLOPE_SCALE),
         (fl + rl - fr - rr) / (2 * chassis.track * _SLOPE_SCALE),
         (fl + rr - fr - rl) / (2 * chassis.track * _TWIST_SCALE),

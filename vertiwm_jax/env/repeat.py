@@ -1,5 +1,6 @@
 """Action repeat: the same environment, decided upon less often."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +9,9 @@ import jax.numpy as jnp
 from gymnax.environments import spaces
 from gymnax.environments.environment import Environment
 
+Controller = Callable[[jax.Array, Any], jax.Array]
+"""`(observation [..., O], key)` to actions `[..., A]` in [-1, 1]."""
+
 
 @dataclass(frozen=True)
 class ActionRepeat(Environment):
@@ -15,10 +19,15 @@ class ActionRepeat(Environment):
 
     Rewards add up. Exploration noise that lasts moves a vehicle where noise that changes at every
     step only shakes it, and credit is given to fewer decisions (Mnih et al., 2015).
+
+    base: a controller that acts anew at every step, and that the held action, in [-1, 1],
+        corrects: learning starts from what it can do (Silver et al., 2018, "Residual policy
+        learning").
     """
 
     env: Environment
     times: int
+    base: Controller | None = None
 
     def reset_env(self, key: jax.Array, params: Any) -> tuple[jax.Array, Any]:
         return self.env.reset_env(key, params)
@@ -27,12 +36,19 @@ class ActionRepeat(Environment):
         self, key: jax.Array, state: Any, action: int | float | jax.Array, params: Any
     ) -> tuple[jax.Array, Any, jax.Array, jax.Array, dict[Any, Any]]:
         keys = jax.random.split(key, self.times)
-        first = self.env.step_env(keys[0], state, action, params)
+
+        def once(observation: jax.Array, state: Any, key: jax.Array) -> tuple:
+            if self.base is None:
+                return self.env.step_env(key, state, action, params)
+            corrected = jnp.clip(self.base(observation, key) + action, -1.0, 1.0)
+            return self.env.step_env(key, state, corrected, params)
+
+        first = once(self.env.observe(key, state, None, params), state, keys[0])
 
         def again(result: tuple, key: jax.Array) -> tuple[tuple, None]:
-            _, state, reward, terminated, _ = result
+            observation, state, reward, terminated, _ = result
             over = terminated | self.env.is_truncated(state, params)
-            more = self.env.step_env(key, state, action, params)
+            more = once(observation, state, key)
             more = (*more[:2], reward + more[2], *more[3:])
             return jax.tree.map(lambda old, new: jnp.where(over, old, new), result, more), None
 

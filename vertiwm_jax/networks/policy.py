@@ -1,7 +1,8 @@
-"""Actor and critic of continuous control: two separate MLPs and a diagonal Gaussian."""
+"""Actor and critic of continuous control: two separate networks and a diagonal Gaussian."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import flax.linen as nn
 import jax
@@ -58,20 +59,65 @@ class MLP(nn.Module):
         return nn.Dense(self.outputs, kernel_init=kernel_init)(x)
 
 
+@dataclass(frozen=True)
+class Candidates:
+    """C actions to choose between, of each of which an observation tells the same things.
+
+    split: `[..., O]` observations to what is seen of each candidate, `[..., C, F]`, and to all
+        the rest, `[..., R]`.
+    actions: the C actions, each of A numbers in [-1, 1].
+    """
+
+    split: Callable[[jax.Array], tuple[jax.Array, jax.Array]]
+    actions: tuple[tuple[float, ...], ...]
+
+
+class Attention(nn.Module):
+    """Looks at every candidate with the same weights and attends to some.
+
+    What is learned of one candidate so holds for all, which takes a fraction of the experience.
+    """
+
+    hidden: Sequence[int]
+    candidates: Candidates
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """`[..., O]` to features `[..., 2 H + R]` and the mean `[..., A]` of attended actions."""
+        seen, rest = self.candidates.split(observation)
+        kernel_init = nn.initializers.orthogonal(math.sqrt(2))
+        first, *more = self.hidden
+        context = nn.Dense(first, use_bias=False, kernel_init=kernel_init)(rest)
+        x = nn.tanh(nn.Dense(first, kernel_init=kernel_init)(seen) + context[..., None, :])
+        for width in more:
+            x = nn.tanh(nn.Dense(width, kernel_init=kernel_init)(x))
+        score = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))(x)
+        share = nn.softmax(score, axis=-2)
+        features = [jnp.sum(share * x, axis=-2), jnp.max(x, axis=-2), rest]
+        action = jnp.sum(share * jnp.asarray(self.candidates.actions), axis=-2)
+        return jnp.concatenate(features, axis=-1), action
+
+
 class Actor(nn.Module):
     """`[..., O]` observations to a `Gaussian` over `actions` actions scaled to [-1, 1].
 
-    The log standard deviation is one learned vector, the same in every state, kept within
-    `LOG_STD_BOUNDS` by a sigmoid so that its gradient never dies at a bound.
+    With candidates the mean corrects the mean of those attended to. The log standard deviation
+    is one learned vector, the same in every state, kept within `LOG_STD_BOUNDS` by a sigmoid so
+    that its gradient never dies at a bound.
     """
 
     actions: int
     hidden: Sequence[int]
     initial_log_std: float
+    candidates: Candidates | None = None
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> Gaussian:
-        mean = MLP(self.hidden, self.actions, output_gain=0.01)(observation)
+        if self.candidates is None:
+            mean = MLP(self.hidden, self.actions, output_gain=0.01)(observation)
+        else:
+            features, attended = Attention(self.hidden, self.candidates)(observation)
+            mean = attended + MLP(self.hidden[-1:], self.actions, output_gain=0.01)(features)
         low, high = LOG_STD_BOUNDS
         share = (self.initial_log_std - low) / (high - low)
         initial = nn.initializers.constant(math.log(share / (1 - share)))
@@ -83,7 +129,12 @@ class Critic(nn.Module):
     """`[..., O]` observations to `[...]` values."""
 
     hidden: Sequence[int]
+    candidates: Candidates | None = None
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
-        return MLP(self.hidden, 1, output_gain=1.0)(observation)[..., 0]
+        hidden, features = self.hidden, observation
+        if self.candidates is not None:
+            features, _ = Attention(hidden, self.candidates)(observation)
+            hidden = hidden[-1:]
+        return MLP(hidden, 1, output_gain=1.0)(features)[..., 0]

@@ -17,9 +17,9 @@ import optax
 from flax import struct
 from gymnax.environments.environment import Environment
 
-from vertiwm_jax.networks.policy import Actor, Critic, Gaussian
+from vertiwm_jax.networks.policy import Actor, Candidates, Critic, Gaussian
 from vertiwm_jax.rl.advantages import discounted_returns, generalised_advantages
-from vertiwm_jax.rl.learned import Controller, MeanAction
+from vertiwm_jax.rl.learned import MeanAction
 from vertiwm_jax.rl.normalise import RunningStatistics
 
 Params = Any
@@ -170,14 +170,13 @@ class PPO:
     env: static; its parameters are an argument of every function.
     outcomes: what to report of an episode, from the `info` of its last step: named scalars,
         which are averaged over the episodes that end in an iteration.
-    base: a controller `(observation, key) -> action` in [-1, 1] whose action the policy corrects:
-        learning starts from what it can do (Silver et al., 2018, "Residual policy learning").
+    candidates: actions that the networks weigh against each other, if the task has such.
     """
 
     env: Environment
     config: PPOConfig
     outcomes: Callable[[dict[str, jax.Array]], Metrics] = lambda info: {}
-    base: Controller | None = None
+    candidates: Candidates | None = None
 
     def init(self, env_params: Params, key: jax.Array) -> TrainState:
         """The state before the first iteration."""
@@ -244,7 +243,7 @@ class PPO:
     def policy(self, env_params: Params, state: TrainState) -> MeanAction:
         """What `state` has learned."""
         actor, params = self._actor(env_params), state.params["actor"]
-        return MeanAction(actor, params, state.observations, self.base)
+        return MeanAction(actor, params, state.observations)
 
     def value(self, state: TrainState, observation: jax.Array) -> jax.Array:
         """`[..., O]` observations to `[...]` values, in units of reward."""
@@ -254,11 +253,12 @@ class PPO:
 
     def _actor(self, env_params: Params) -> Actor:
         actions = math.prod(self.env.action_space(env_params).shape)
-        return Actor(actions, self.config.hidden, self.config.initial_log_std)
+        config = self.config
+        return Actor(actions, config.hidden, config.initial_log_std, self.candidates)
 
     @property
     def _critic(self) -> Critic:
-        return Critic(self.config.hidden)
+        return Critic(self.config.hidden, self.candidates)
 
     @property
     def _optimiser(self) -> optax.GradientTransformation:
@@ -284,8 +284,7 @@ class PPO:
             seen = state.observations.normalise(environments.observation)
             policy = cast(Gaussian, actor.apply(state.params["actor"], seen))
             action = policy.sample(action_key)
-            base = self.base(environments.observation, action_key) if self.base else 0.0
-            bounded = low + (high - low) * (jnp.clip(base + action, -1, 1) + 1) / 2
+            bounded = low + (high - low) * (jnp.clip(action, -1, 1) + 1) / 2
             step_keys = jax.random.split(step_key, self.config.num_envs)
             observation, env_state, reward, terminated, truncated, info = step(
                 step_keys, environments.state, bounded, env_params
