@@ -10,10 +10,10 @@ import jax
 import numpy as np
 import pytest
 
+from vertiwm_jax import checkpoints, evaluate, ppo, runs
 from vertiwm_jax import config as configuration
-from vertiwm_jax import evaluate, ppo, runs
 from vertiwm_jax.ppo import TrainConfig
-from vertiwm_jax.rl import checkpoints, task
+from vertiwm_jax.rl import task
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map

@@ -12,6 +12,7 @@ import tyro
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import ppo, runs
+from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.evaluation import prediction, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
@@ -22,7 +23,6 @@ from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.ppo import TrainConfig
 from vertiwm_jax.rl import ground, task
-from vertiwm_jax.rl.checkpoints import CheckpointError
 from vertiwm_jax.runs import RunError
 from vertiwm_jax.terrain.worlds import Difficulty
 

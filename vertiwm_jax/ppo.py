@@ -13,6 +13,7 @@ import numpy as np
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
+from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
 from vertiwm_jax.env.observation import ARCS
 from vertiwm_jax.env.repeat import ActionRepeat, Controller
@@ -21,13 +22,13 @@ from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
 from vertiwm_jax.evaluation.navigation import Policy
 from vertiwm_jax.evaluation.report import Results, drive
 from vertiwm_jax.rl import task
-from vertiwm_jax.rl.checkpoints import CheckpointError
 from vertiwm_jax.rl.learned import Corrected
-from vertiwm_jax.rl.loop import LoopConfig, TrainingError, TrainingInterrupted, restore, train
+from vertiwm_jax.rl.loop import LoopConfig, restore, train
 from vertiwm_jax.rl.ppo import PPO, PPOConfig, TrainState
 from vertiwm_jax.rl.task import TaskConfig
 from vertiwm_jax.runs import Run, RunError
 from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.training import TrainingError, TrainingInterrupted
 
 Rows = dict[str, Policy]
 

@@ -8,11 +8,11 @@ import pytest
 from flax import struct
 from rl.probes import Broken, ProbeParams, Target
 
-from vertiwm_jax import runs
-from vertiwm_jax.rl import checkpoints
-from vertiwm_jax.rl.loop import LoopConfig, TrainingError, TrainingInterrupted, restore, train
+from vertiwm_jax import checkpoints, runs
+from vertiwm_jax.rl.loop import LoopConfig, restore, train
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.runs import Run
+from vertiwm_jax.training import TrainingError, TrainingInterrupted
 
 CONFIG = PPOConfig(
     transitions=6 * 32, num_envs=4, num_steps=8, minibatches=2, epochs=2, hidden=(8,)
@@ -94,24 +94,6 @@ def test_metrics_checkpoints_and_the_finished_state(new_run, capsys):
     assert len(runs.read_metrics(run.folder)) == 10
 
 
-def test_a_second_interrupt_stops_at_once(new_run, monkeypatch):
-    run = new_run()
-    log = Run.log
-
-    def stopping(self, step, metrics):
-        log(self, step, metrics)
-        if step == 6:
-            os.kill(os.getpid(), signal.SIGINT)
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(Run, "log", stopping)
-    with pytest.raises(KeyboardInterrupt):
-        go(Counting(), run, 10, jnp.float32(0))
-    latest = checkpoints.latest(run.folder / "checkpoints")
-    assert latest is not None and latest.name == "4"
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
 def test_a_number_that_is_none_stops_with_the_last_good_checkpoint(new_run):
     run = new_run()
     with pytest.raises(TrainingError, match=r"iteration 6: .*checkpoints/4; try") as error:
@@ -129,5 +111,7 @@ def test_a_run_of_another_shape_cannot_be_resumed(new_run):
 
 
 def test_settings_below_one_are_refused():
+    with pytest.raises(ValueError, match="seeds: expected at least 1, found 0"):
+        LoopConfig(seeds=0)
     with pytest.raises(ValueError, match="keep: expected at least 1, found 0"):
         LoopConfig(keep=0)

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from vertiwm_jax.rl import checkpoints
-from vertiwm_jax.rl.checkpoints import CheckpointError
+from vertiwm_jax import checkpoints
+from vertiwm_jax.checkpoints import CheckpointError
 
 
 def state(size=4):
@@ -94,7 +94,7 @@ def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, capfd):
 
 WRITER = """
 import sys, jax
-from vertiwm_jax.rl import checkpoints
+from vertiwm_jax import checkpoints
 def state(scale): return {"noise": scale * jax.random.normal(jax.random.key(0), (4000, 5000))}
 checkpoints.save(sys.argv[1], 1, state(1.0), keep=1)
 print("first", flush=True)

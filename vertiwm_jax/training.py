@@ -1,0 +1,166 @@
+"""The host loop of training: progress, metrics and checkpoints around a compiled algorithm."""
+
+import contextlib
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol, TypeVar
+
+import jax
+import numpy as np
+
+from vertiwm_jax import checkpoints
+from vertiwm_jax.runs import Run
+
+State = TypeVar("State")
+
+
+class Algorithm(Protocol[State]):
+    """A learning algorithm: two pure functions, compiled whole; `data` is what it learns from.
+
+    `iterate` gives scalar metrics, or arrays of them whose mean is reported; NaN is no value. Its
+    `finite` says whether training can go on.
+    """
+
+    def init(self, data: Any, key: jax.Array, /) -> State: ...
+
+    def iterate(self, data: Any, state: State, /) -> tuple[State, dict[str, jax.Array]]: ...
+
+
+@dataclass(frozen=True)
+class CheckpointConfig:
+    """What is kept of a training."""
+
+    checkpoint_every: int = 20
+    """Iterations between checkpoints."""
+    keep: int = 3
+    """Newest checkpoints that are kept."""
+
+    def __post_init__(self):
+        for name in ("checkpoint_every", "keep"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Work:
+    """What an iteration gets done, for rates and metrics, and which metrics the progress shows."""
+
+    unit: str
+    amount: int
+    shown: tuple[str, ...]
+
+
+class TrainingError(RuntimeError):
+    """Training cannot go on; the message says what is left to go on from."""
+
+
+class TrainingInterrupted(RuntimeError):
+    """The user stopped the training; the message says where it was saved."""
+
+
+def restore(algorithm: Algorithm[State], data: Any, folder: Path) -> tuple[int, State] | None:
+    """Iterations done and state in the newest checkpoint of the run in `folder`, if it has one.
+
+    A checkpoint of another configuration raises `CheckpointError`.
+    """
+    checkpoint = checkpoints.latest(folder / "checkpoints")
+    if checkpoint is None:
+        return None
+    like = jax.eval_shape(algorithm.init, data, jax.random.key(0))
+    return int(checkpoint.name), checkpoints.load(checkpoint, like)
+
+
+def train(
+    algorithm: Algorithm[State],
+    data: Any,
+    key: jax.Array,
+    run: Run,
+    iterations: int,
+    work: Work,
+    config: CheckpointConfig,
+    restored: tuple[int, State] | None = None,
+) -> State:
+    """Trains until `iterations` are done, from the beginning or from what `restore` gave.
+
+    Gives the final state. Ctrl-C ends the current iteration, saves and raises
+    `TrainingInterrupted`; a second one stops at once. `TrainingError` when an iteration says that
+    it is not finite.
+    """
+    folder = run.folder / "checkpoints"
+    if restored:
+        done, state = restored
+    else:
+        done, state = 0, jax.jit(algorithm.init)(data, key)
+        # Placed as a restored state is, so that both run the same program.
+        state = jax.device_put(state, jax.devices()[0])
+    if done >= iterations:
+        return state
+
+    print("compiling ...", flush=True)
+    start = time.perf_counter()
+    iterate = jax.jit(algorithm.iterate, donate_argnums=1).lower(data, state).compile()
+    print(f"compiled in {time.perf_counter() - start:.0f} s", flush=True)
+
+    total = (iterations - done) * work.amount
+    with _interruptible() as interrupted, run.progress(total, "training") as progress:
+        while done < iterations and not interrupted:
+            start = time.perf_counter()
+            state, metrics = iterate(data, state)
+            metrics = jax.device_get(metrics)
+            seconds = time.perf_counter() - start
+            done += 1
+            if not np.all(metrics.pop("finite")):
+                raise TrainingError(_diverged(done, checkpoints.latest(folder)))
+            scalars = {name: _mean(value) for name, value in metrics.items()}
+            scalars = {name: value for name, value in scalars.items() if value is not None}
+            scalars[work.unit] = done * work.amount
+            scalars[f"{work.unit}_per_second"] = work.amount / seconds
+            run.log(done, scalars)
+            shown = (f"{name} {scalars[name]:.4g}" for name in work.shown if name in scalars)
+            progress.advance(work.amount, "  ".join(shown))
+            if done % config.checkpoint_every == 0:
+                checkpoints.save(folder, done, state, config.keep)
+        if done % config.checkpoint_every:
+            checkpoints.save(folder, done, state, config.keep)
+    if done < iterations:
+        raise TrainingInterrupted(
+            f"stopped after iteration {done} of {iterations}, all saved; "
+            f"go on with --resume {run.folder}"
+        )
+    return state
+
+
+def _mean(values: np.ndarray) -> float | None:
+    """Mean over those that have a value; None if none has."""
+    values = values[~np.isnan(values)]
+    return float(values.mean()) if values.size else None
+
+
+def _diverged(iteration: int, checkpoint: Path | None) -> str:
+    left = f"the last good checkpoint is {checkpoint}" if checkpoint else "nothing was saved yet"
+    return (
+        f"iteration {iteration}: loss or weights are no longer finite; {left}; "
+        "try a lower learning rate, and look for inputs that are not finite"
+    )
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[list[int]]:
+    """The first Ctrl-C is noted in the list that this gives, the second acts as always."""
+    seen: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(number: int, frame: FrameType | None) -> None:
+        seen.append(number)
+        signal.signal(signal.SIGINT, before)
+        print("\nstopping after this iteration; Ctrl-C again stops at once", flush=True)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield seen
+    finally:
+        signal.signal(signal.SIGINT, before)
