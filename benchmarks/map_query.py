@@ -22,7 +22,7 @@ def main() -> None:
     drawn = measure(lambda keys: worlds.generate(keys, config), world_keys, seconds=0.5)
     terrain = worlds.generate(world_keys, config)
     xy_key, yaw_key, point_key = jax.random.split(jax.random.key(1), 3)
-    xy = jax.random.uniform(xy_key, (VEHICLES, 2), minval=-60.0, maxval=60.0)
+    position = jax.random.uniform(xy_key, (VEHICLES, 3), minval=-60.0, maxval=60.0)
     yaw = jax.random.uniform(yaw_key, (VEHICLES,), minval=-jnp.pi, maxval=jnp.pi)
     points = jax.random.uniform(point_key, (POINTS // 4, 4, 2), minval=-60.0, maxval=60.0)
     world = jnp.arange(VEHICLES)
@@ -33,7 +33,7 @@ def main() -> None:
     )
     surface = jax.jit(jax.vmap(lambda m, w, p: query.surface(m.select(w), p), (None, 0, 0)))
 
-    seen = measure(patches, terrain, world, xy, yaw)
+    seen = measure(patches, terrain, world, position, yaw)
     touched = measure(surface, terrain, worlds_of_points, points)
     report(
         "map query",

@@ -2,8 +2,9 @@ import jax.numpy as jnp
 import numpy as np
 from learning.recordings import STEPS, drives, write
 
-from vertiwm_jax.learning import dataset
-from vertiwm_jax.learning.normalisation import Normalisation
+from vertiwm_jax.learning import dataset, normalisation
+from vertiwm_jax.state import VehicleState
+from vertiwm_jax.world_model import motion
 
 
 def loaded(folder, **changes):
@@ -20,7 +21,7 @@ def test_valid_steps_have_zero_mean_and_unit_deviation(tmp_path):
     length[3] = 10
     state[3, 11:], control[3, 10:] = 1e4, 1e4
     recorded = loaded(tmp_path, state=state, control=control, length=length)
-    constants = Normalisation.of(recorded)
+    constants = normalisation.measure(recorded)
     valid = np.arange(STEPS + 1) <= recorded.length[:, None]
     normalised = np.asarray(constants.state(jnp.asarray(recorded.state)))[valid]
     assert normalised.shape[1] == 8
@@ -29,17 +30,18 @@ def test_valid_steps_have_zero_mean_and_unit_deviation(tmp_path):
     commands = np.asarray(constants.command(jnp.asarray(recorded.control)))[valid[:, 1:]]
     np.testing.assert_allclose(commands.mean(0), 0, atol=1e-4)
     np.testing.assert_allclose(commands.std(0), 1, rtol=1e-4)
-
-
-def test_neither_place_nor_heading_matters(tmp_path):
-    constants = Normalisation.of(loaded(tmp_path))
-    state = np.random.default_rng(0).normal(size=12)
-    moved = state + np.where(np.isin(np.arange(12), [0, 1, 2, 5]), 7.0, 0.0)
-    np.testing.assert_array_equal(constants.state(state), constants.state(moved))
+    before, after = (
+        VehicleState.from_vector(jnp.asarray(x)[valid[:, 1:]])
+        for x in (recorded.state[:, :-1], recorded.state[:, 1:])
+    )
+    transitions = motion.transition(before, after)
+    np.testing.assert_allclose(transitions.mean(0), constants.transition_mean, atol=1e-4)
+    np.testing.assert_allclose(transitions.std(0), constants.transition_deviation, rtol=1e-4)
 
 
 def test_what_never_changes_is_left_in_its_units(tmp_path):
-    constants = Normalisation.of(loaded(tmp_path))
+    constants = normalisation.measure(loaded(tmp_path))
     assert constants.state_deviation[0] == 1
     assert constants.command_deviation[1] == 1
     assert constants.state_deviation[2] < 1
+    assert constants.transition_deviation[11] == 1

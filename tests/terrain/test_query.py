@@ -1,3 +1,5 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -6,8 +8,10 @@ import pytest
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.classes import STANDARD
+from vertiwm_jax.terrain.query import PatchConfig
 
 MUD, CONCRETE, GRASS = (STANDARD.names.index(name) for name in ("mud", "concrete", "grass"))
+PAPER, RELATIVE = PatchConfig(), PatchConfig("vehicle", "bilinear")
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +32,19 @@ def terrain():
 
 
 surface_of = jax.jit(lambda terrain, world, xy: query.surface(terrain.select(world), xy))
-patches_of = jax.jit(lambda terrain, world, xy, yaw: query.patches(terrain.select(world), xy, yaw))
+
+
+@partial(jax.jit, static_argnums=4)
+def patches_of(terrain, world, position, yaw, config=PAPER):
+    return query.patches(terrain.select(world), position, yaw, config)
+
+
+def bilinear(z, u, v):
+    """Heights between the four vertices around column u, row v, in double precision."""
+    c, r = np.minimum(u.astype(int), z.shape[1] - 2), np.minimum(v.astype(int), z.shape[0] - 2)
+    f, g = u - c, v - r
+    top, bottom = (z[i, c] * (1 - f) + z[i, c + 1] * f for i in (r, r + 1))
+    return top * (1 - g) + bottom * g
 
 
 def reference_surface(terrain, world, x, y):
@@ -76,7 +92,7 @@ def reference_patches(terrain, world, x, y, yaw):
 @pytest.mark.parametrize("pose", [(1.3, 2.7, 0.6), (-6.0, 10.0, -2.2)])
 def test_patches_equal_a_plain_loop(terrain, pose):
     x, y, yaw = pose
-    found = patches_of(terrain, 1, jnp.array([x, y]), jnp.float32(yaw))
+    found = patches_of(terrain, 1, jnp.array([x, y, 0.0]), jnp.float32(yaw))
     elevation, rgb = reference_patches(terrain, 1, x, y, yaw)
     # Pixels on a rounding border may fall either way in float32.
     assert np.mean(np.abs(found.elevation - elevation) > 1e-5) < 1e-3
@@ -97,7 +113,8 @@ def test_patches_show_bump_and_colour_where_they_are(eighth):
     near = np.hypot(cell[None, :] - spot[0], -cell[:, None] - spot[1]) < 0.8
     terrain = terrain_map.build(elevation, np.where(near, CONCRETE, GRASS), resolution=0.25)
 
-    found = patches_of(terrain, 0, jnp.array(vehicle, jnp.float32), jnp.float32(yaw))
+    position = jnp.array([*vehicle, 0.0], jnp.float32)
+    found = patches_of(terrain, 0, position, jnp.float32(yaw))
     row, column = np.unravel_index(np.argmax(found.elevation), (128, 128))
     assert abs(row - 23.5) <= 2 and abs(column - 63.5) <= 2
     coloured = np.argwhere(np.asarray(found.rgb)[..., 2] > 0)  # concrete alone is bluish
@@ -106,13 +123,13 @@ def test_patches_show_bump_and_colour_where_they_are(eighth):
 
 
 def test_patches_are_bounded_and_batch_over_worlds(terrain):
-    xy = jnp.array([[0.0, 0.0], [100.0, -100.0], [-1e9, 3.0]])
+    position = jnp.array([[0.0, 0.0, 0.0], [100.0, -100.0, 0.0], [-1e9, 3.0, 0.0]])
     axes = (None, 0, 0, 0)
     batched = jax.jit(jax.vmap(lambda t, w, p, a: query.patches(t.select(w), p, a), axes))
-    found = batched(terrain, jnp.array([0, 1, 2]), xy, jnp.zeros(3))
+    found = batched(terrain, jnp.array([0, 1, 2]), position, jnp.zeros(3))
     assert found.elevation.shape == (3, 128, 128) and found.rgb.shape == (3, 128, 128, 3)
     for world in range(3):
-        alone = patches_of(terrain, world, xy[world], jnp.float32(0))
+        alone = patches_of(terrain, world, position[world], jnp.float32(0))
         np.testing.assert_array_equal(found.elevation[world], alone.elevation)
         np.testing.assert_array_equal(found.rgb[world], alone.rgb)
     # Far off the map, every pixel is its nearest corner.
@@ -122,18 +139,48 @@ def test_patches_are_bounded_and_batch_over_worlds(terrain):
 
 @pytest.mark.parametrize("pose", [(np.nan, np.nan, 0.0), (0.0, 0.0, np.nan)])
 def test_nan_pose_sees_the_first_vertex(terrain, pose):
-    found = patches_of(terrain, 2, jnp.array(pose[:2]), jnp.float32(pose[2]))
+    found = patches_of(terrain, 2, jnp.array([*pose[:2], 0.0]), jnp.float32(pose[2]))
     np.testing.assert_allclose(found.elevation, terrain.elevation[2, 0, 0] / 8 - 1, atol=1e-6)
     assert np.isfinite(found.rgb).all()
 
 
 def test_no_gradient_flows_from_patches_to_the_pose(terrain):
-    def total(xy, yaw):
-        found = query.patches(terrain, xy, yaw)
+    def total(position, yaw):
+        found = query.patches(terrain, position, yaw, RELATIVE)
         return found.elevation.sum() + found.rgb.sum()
 
-    by_xy, by_yaw = jax.grad(total, (0, 1))(jnp.array([1.0, 2.0]), jnp.float32(0.3))
-    assert not np.any(by_xy) and not np.any(by_yaw)
+    slopes = jax.grad(total, (0, 1))(jnp.array([1.0, 2.0, 1.5]), jnp.float32(0.3))
+    assert not any(np.any(slope) for slope in slopes)
+
+
+def test_bilinear_patches_relative_to_the_vehicle(terrain):
+    x, y, z, yaw = 2.3, 1.7, 1.25, -0.8
+    found = patches_of(terrain, 1, jnp.array([x, y, z]), jnp.float32(yaw), RELATIVE)
+    place = 6.35 - 0.1 * np.arange(128)
+    ahead, left = place[:, None], place[None, :]
+    px = x + np.cos(yaw) * ahead - np.sin(yaw) * left
+    py = y + np.sin(yaw) * ahead + np.cos(yaw) * left
+    u, v = np.clip((px + 7) / 0.5, 0, 40), np.clip((11 - py) / 0.5, 0, 32)
+    expected = (bilinear(np.asarray(terrain.elevation[1], float), u, v) - z) / 4
+    np.testing.assert_allclose(found.elevation, expected, atol=1e-5)
+    paper = patches_of(terrain, 1, jnp.array([x, y, z]), jnp.float32(yaw))
+    np.testing.assert_array_equal(found.rgb, paper.rgb)
+
+
+@pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
+def test_references_differ_by_the_height_of_the_vehicle_and_the_scale(terrain, interpolation):
+    position = jnp.array([2.0, 1.0, 1.5])
+    by_map, by_vehicle = (
+        patches_of(terrain, 0, position, 0.4, PatchConfig(reference, interpolation)).elevation
+        for reference in ("map", "vehicle")
+    )
+    np.testing.assert_allclose(4 * by_vehicle + 1.5, 8 * (by_map + 1), atol=1e-5)
+
+
+def test_ground_far_above_or_below_the_vehicle_is_cut_off(terrain):
+    for height, expected in ((30.0, -1), (-30.0, 1)):
+        found = patches_of(terrain, 0, jnp.array([0.0, 0.0, height]), 0.0, RELATIVE)
+        np.testing.assert_array_equal(found.elevation, expected)
 
 
 def test_surface_equals_the_definition(terrain):

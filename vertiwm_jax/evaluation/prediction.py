@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.dynamics import Dynamics, Params, rollout, warm_up
+from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.learning.rollouts import open_loop
 from vertiwm_jax.learning.windows import GROUNDS, Windows
-from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 
 
@@ -22,17 +23,12 @@ def predict(
     The history is warmed up on the recorded context; from its last state on, the model sees its
     own predictions and the recorded commands (the paper's protocol, Sec. V-A).
     """
-    c = windows.context
 
-    def one(state: jax.Array, control: jax.Array, world: jax.Array) -> VehicleState:
-        ground = terrain.select(world)
-        recorded = VehicleState.from_vector(state[: c + 1])
-        before, ahead = Command.from_vector(control[:c]), Command.from_vector(control[c:])
-        history = warm_up(dynamics, params, ground, recorded, before)
-        start = jax.tree.map(lambda x: x[c], recorded)
-        return rollout(dynamics, params, ground, history, start, ahead)
+    def one(window: Windows) -> VehicleState:
+        ground = terrain.select(window.world)
+        return open_loop(dynamics, params, ground, window, lambda _: None)[0]
 
-    return jax.vmap(one)(windows.state, windows.control, windows.world)
+    return jax.vmap(one)(windows)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,9 @@ so that a batch of vehicles on different worlds is one gather and copies no map.
 the ground continues level from its edge; a NaN coordinate reads the first row or column.
 """
 
+from dataclasses import dataclass
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -14,6 +17,23 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 PATCH_PIXELS = 128
 PATCH_METRES = 12.8
+RELIEF_METRES = 4.0
+"""Height above or below the vehicle that is 1 in patches relative to it."""
+
+
+@dataclass(frozen=True)
+class PatchConfig:
+    """How heights become elevation patches.
+
+    reference: "map" scales the map's `elevation_range` to [-1, 1], as the paper does; "vehicle"
+        takes heights above the body origin, over `RELIEF_METRES`, which do not change when map
+        and vehicle are lifted together.
+    interpolation: "nearest" vertex, as in the paper, which draws a coarse grid as stairs; or
+        "bilinear" between vertices, at four times the reads.
+    """
+
+    reference: Literal["map", "vehicle"] = "map"
+    interpolation: Literal["nearest", "bilinear"] = "nearest"
 
 
 @struct.dataclass
@@ -32,28 +52,35 @@ class Surface:
     friction: jax.Array
 
 
-def patches(terrain: TerrainMap, position_xy: jax.Array, yaw: jax.Array) -> Patches:
-    """What one vehicle at `[2]` p_world (m) and `[]` yaw (rad) sees, in [-1, 1] (Eq. 1's m_t).
+def patches(
+    terrain: TerrainMap, position: jax.Array, yaw: jax.Array, config: PatchConfig = PatchConfig()
+) -> Patches:
+    """What one vehicle at `[3]` p_world (m) and `[]` yaw (rad) sees, in [-1, 1] (Eq. 1's m_t).
 
     Pixels are 0.1 m, row 0 farthest ahead, column 0 farthest left, the vehicle midway between
-    the four central ones. Nearest vertex for elevation, containing cell for colour. Pixels off
-    the map take the nearest edge; a NaN pose sees vertex (0, 0) in every pixel. No gradient
-    flows to the pose. Batch with `vmap`, selecting each vehicle's world inside.
+    the four central ones; each has the colour of its cell. Pixels off the map take the nearest
+    edge; a NaN x, y or yaw sees vertex (0, 0) in every pixel, a NaN height NaN elevations where
+    they are relative to it. No gradient flows to the pose: it counts as given. Batch with `vmap`,
+    selecting each vehicle's world inside.
     """
+    position, yaw = jax.lax.stop_gradient((position, yaw))
     pixel = PATCH_METRES / PATCH_PIXELS
     offset = ((PATCH_PIXELS - 1) / 2 - jnp.arange(PATCH_PIXELS)) * pixel
     ahead, left = offset[:, None], offset[None, :]
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    x = position_xy[0] + cos * ahead - sin * left
-    y = position_xy[1] + sin * ahead + cos * left
+    x = position[0] + cos * ahead - sin * left
+    y = position[1] + sin * ahead + cos * left
     column, row = _grid_coordinates(terrain, x, y)
 
-    _, rows, columns = terrain.elevation.shape
-    nearest = _flat_index(
-        terrain, rows, columns, (row + 0.5).astype(jnp.int32), (column + 0.5).astype(jnp.int32)
-    )
-    low, high = terrain.elevation_range
-    elevation = 2 * (_gather(terrain.elevation, nearest) - low) / (high - low) - 1
+    if config.interpolation == "nearest":
+        heights = _nearest(terrain, row, column)
+    else:
+        heights = _bilinear(terrain, row, column)
+    if config.reference == "map":
+        low, high = terrain.elevation_range
+        elevation = 2 * (heights - low) / (high - low) - 1
+    else:
+        elevation = (heights - position[2]) / RELIEF_METRES
     palette = jnp.clip(terrain.class_rgb.astype(jnp.float32) / 127.5 - 1, -1, 1)
     semantic = _gather(terrain.semantic, _cell_index(terrain, row, column)).astype(jnp.int32)
     rgb = palette.at[semantic].get(mode="promise_in_bounds")
@@ -90,8 +117,7 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
 def height(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     """`[..., 2]` p_world to `[...]` bilinear height, m, whatever the class."""
     column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
-    bottom_left, along, up, twist, fx, fy = _corners(terrain, row, column)
-    return bottom_left + fx * along + fy * up + twist * fx * fy
+    return _bilinear(terrain, row, column)
 
 
 def normal(gradient: jax.Array) -> jax.Array:
@@ -156,6 +182,20 @@ def _cell_index(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.A
     i = jnp.minimum((row * (cell_rows / (rows - 1))).astype(jnp.int32), cell_rows - 1)
     j = jnp.minimum((column * (cell_columns / (columns - 1))).astype(jnp.int32), cell_columns - 1)
     return _flat_index(terrain, cell_rows, cell_columns, i, j)
+
+
+def _nearest(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Array:
+    """Heights of the vertices next to fractional coordinates on the map, m."""
+    _, rows, columns = terrain.elevation.shape
+    nearest_row, nearest_column = (row + 0.5).astype(jnp.int32), (column + 0.5).astype(jnp.int32)
+    index = _flat_index(terrain, rows, columns, nearest_row, nearest_column)
+    return _gather(terrain.elevation, index)
+
+
+def _bilinear(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Array:
+    """Heights at fractional coordinates on the map, bilinear between vertices, m."""
+    bottom_left, along, up, twist, fx, fy = _corners(terrain, row, column)
+    return bottom_left + fx * along + fy * up + twist * fx * fy
 
 
 def _corners(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> tuple[jax.Array, ...]:

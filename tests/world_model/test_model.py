@@ -1,0 +1,273 @@
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from world_model.examples import CONSTANTS, TINY, commands, count, driving, moved, rough
+
+from vertiwm_jax.dynamics import rollout
+from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.query import PatchConfig
+from vertiwm_jax.world_model import motion
+from vertiwm_jax.world_model.model import VertiWM
+from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception
+from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
+
+TERRAIN, TAUGHT = rough(), Exteroception(PatchConfig())
+
+
+@struct.dataclass
+class SeeingParams:
+    physics: Any
+    encoders: EncoderParams
+
+
+@struct.dataclass
+class SeeingHistory:
+    physics: Any
+    perception: Perception
+
+
+@dataclass(frozen=True)
+class SeeingBicycle:
+    """Physics that looks at the ground, as little as a specialist can be."""
+
+    exteroception: Exteroception = Exteroception()
+    bicycle: KinematicBicycle = KinematicBicycle()
+
+    def init(self, params, terrain, state):
+        perception = self.perceive(params, self.exteroception.query(terrain, state))
+        return SeeingHistory(self.bicycle.init(params.physics, terrain, state), perception)
+
+    def step(self, params, terrain, history, state, command):
+        state, history = self.propose(params, terrain, history, state, command)
+        perception = self.perceive(params, self.exteroception.query(terrain, state))
+        return state, replace(history, perception=perception)
+
+    def propose(self, params, terrain, history, state, command):
+        arguments = (params.physics, terrain, history.physics, state, command)
+        state, physics = self.bicycle.step(*arguments)
+        return state, replace(history, physics=physics)
+
+    def perceive(self, params, patches):
+        return self.exteroception.encode(params.encoders, patches)
+
+
+TRANSFORMER, PHYSICS = TransformerSpecialist(replace(TINY, layers=1)), SeeingBicycle()
+MODEL = VertiWM(TRANSFORMER, PHYSICS)
+KEYS = jax.random.split(jax.random.key(0), 3)
+OF_TRANSFORMER = moved(jax.jit(TRANSFORMER.init_params)(KEYS[0], CONSTANTS))
+OF_PHYSICS = SeeingParams(bicycle_of(hmmwv()), jax.jit(Exteroception().init_params)(KEYS[1]))
+UNTRAINED = jax.jit(MODEL.init_params)(KEYS[2], OF_TRANSFORMER, OF_PHYSICS)
+PARAMS = replace(UNTRAINED, gate=moved(UNTRAINED.gate))
+
+
+STATE, CONTROL = driving(1), commands(12)
+COMMAND = jax.tree.map(lambda x: x[0], CONTROL)
+
+
+@partial(jax.jit, static_argnames="model")
+def init(params, terrain, state, model=MODEL):
+    return model.init(params, terrain, state)
+
+
+@partial(jax.jit, static_argnames="model")
+def step(params, terrain, history, state, command, model=MODEL):
+    return model.step(params, terrain, history, state, command)
+
+
+@partial(jax.jit, static_argnames="model")
+def alone(params, terrain, state, commands, model):
+    """The states of a rollout of one specialist."""
+    history = model.init(params, terrain, state)
+    return rollout(model, params, terrain, history, state, commands)
+
+
+def fuse(params, terrain, state, commands, model=MODEL):
+    """The states of a rollout, and every coefficient of it, `[T, 4]`."""
+
+    def advance(carry, command):
+        state, history = model.step(params, terrain, carry[1], carry[0], command)
+        return (state, history), (state, history.coefficients)
+
+    start = state, model.init(params, terrain, state)
+    return jax.lax.scan(advance, start, commands)[1]
+
+
+fused = partial(jax.jit, static_argnames="model")(fuse)
+
+
+def with_outputs(outputs):
+    """Parameters of a gate that gives `outputs`, whatever it sees."""
+    network = jax.tree.map(jnp.zeros_like, PARAMS.gate.network)
+    network["params"]["Dense_2"]["bias"] = jnp.asarray(outputs, jnp.float32)
+    return replace(PARAMS, gate=replace(PARAMS.gate, network=network))
+
+
+@pytest.mark.parametrize(("terrain", "parameters"), [("mean", 33_764), ("both", 37_220)])
+def test_gate_has_the_parameters_of_the_paper(terrain, parameters):
+    model = VertiWM(TRANSFORMER, PHYSICS, gate_terrain=terrain)
+    gate = jax.eval_shape(model.init_params, KEYS[2], OF_TRANSFORMER, OF_PHYSICS).gate
+    assert count(gate.network) == parameters
+
+
+@pytest.mark.parametrize(("alpha", "specialist"), [(0, "transformer"), (1, "nesam")])
+def test_all_of_one_specialist_is_that_specialist(alpha, specialist):
+    """A whole rollout, so each has its history and sees the fused state as if it were alone."""
+    params = with_outputs(np.full(4, np.arctanh((alpha - 0.5) / 1.5)))
+    together, _ = fused(params, TERRAIN, STATE, CONTROL)
+    model, params = getattr(MODEL, specialist), getattr(params, specialist)
+    expected = alone(params, TERRAIN, STATE, CONTROL, model=model)
+    np.testing.assert_allclose(together.vector, expected.vector, atol=2e-4)
+
+
+def test_an_untrained_gate_takes_the_middle_of_both():
+    runs = (
+        fused(UNTRAINED, TERRAIN, STATE, CONTROL)[0],
+        alone(OF_TRANSFORMER, TERRAIN, STATE, CONTROL, model=TRANSFORMER),
+        alone(OF_PHYSICS, TERRAIN, STATE, CONTROL, model=PHYSICS),
+    )
+    together, one, other = (jax.tree.map(lambda x: x[0], run) for run in runs)
+    for of in (lambda state: motion.increment(STATE, state), motion.twist):
+        np.testing.assert_allclose(of(together), 0.5 * (of(one) + of(other)), atol=1e-5)
+
+
+def test_both_see_the_fused_state_through_their_own_encoders():
+    model = replace(MODEL, nesam=SeeingBicycle(TAUGHT))
+    history = init(PARAMS, TERRAIN, STATE, model=model)
+    after, history = step(PARAMS, TERRAIN, history, STATE, COMMAND, model=model)
+    for name in ("transformer", "nesam"):
+        specialist, params = getattr(model, name), getattr(PARAMS, name)
+        expected = init(params, TERRAIN, after, model=specialist).perception
+        seen = getattr(history, name).perception
+        # A pixel on a border between classes may fall to its other side.
+        np.testing.assert_allclose(seen.elevation, expected.elevation, atol=1e-4)
+        assert np.mean(np.abs(seen.semantic - expected.semantic) > 1e-4) < 1e-2
+    assert history.perception is history.transformer.perception
+
+
+def test_shared_patches_are_queried_once(monkeypatch):
+    calls = []
+    plain = query.patches
+    monkeypatch.setattr(query, "patches", lambda *a: calls.append(a[-1]) or plain(*a))
+    for model, expected in ((MODEL, 1), (replace(MODEL, nesam=SeeingBicycle(TAUGHT)), 2)):
+        history = jax.eval_shape(model.init, PARAMS, TERRAIN, STATE)
+        calls.clear()
+        jax.eval_shape(model.step, PARAMS, TERRAIN, history, STATE, COMMAND)
+        assert len(calls) == expected
+
+
+def test_coefficients_are_in_the_history_and_vary_along_a_drive():
+    _, alphas = fused(PARAMS, TERRAIN, STATE, CONTROL)
+    assert alphas.shape == (12, 4)
+    assert bool(jnp.all((alphas > -1) & (alphas < 2))) and float(jnp.ptp(alphas, 0).min()) > 1e-2
+    start = init(PARAMS, TERRAIN, STATE)
+    np.testing.assert_array_equal(start.coefficients, 0.5)
+    np.testing.assert_array_equal(start.hidden, 0)
+
+
+def test_a_scalar_gate_has_one_coefficient():
+    model = replace(MODEL, coefficients="scalar")
+    _, alphas = fused(PARAMS, TERRAIN, STATE, CONTROL, model=model)
+    np.testing.assert_array_equal(alphas, np.repeat(alphas[:, :1], 4, axis=1))
+    assert np.ptp(alphas[:, 0]) > 1e-3
+    constant = with_outputs([0.1, 0.2, 0.3, 0.6])
+    _, alphas = fused(constant, TERRAIN, STATE, CONTROL, model=model)
+    np.testing.assert_allclose(alphas, 0.5 + 1.5 * np.tanh(0.3), rtol=1e-5)
+
+
+def first_coefficients(params, terrain=TERRAIN, state=STATE, **changes):
+    history = replace(init(params, terrain, state), **changes)
+    return step(params, terrain, history, state, COMMAND)[1].coefficients
+
+
+def test_the_gate_remembers():
+    hidden = jnp.linspace(-0.5, 0.5, 64)
+    change = first_coefficients(PARAMS) - first_coefficients(PARAMS, hidden=hidden)
+    assert float(jnp.abs(change).min()) > 1e-3
+
+
+def test_constants_bring_the_context_to_unit_size():
+    """Place and heading are left out at first; a mean and a scale are a change of units."""
+    far = replace(STATE, position=STATE.position + jnp.array([3.0, -2.0, 0.0]))
+    level = rough(elevation=np.full((49, 49), 4.0), semantic=np.full((12, 12), 9))
+    gate = PARAMS.gate
+    everywhere = replace(PARAMS, gate=replace(gate, scale=jnp.ones_like(gate.scale)))
+    here, there = (first_coefficients(PARAMS, level, state) for state in (STATE, far))
+    np.testing.assert_allclose(here, there, atol=1e-4)
+    here, there = (first_coefficients(everywhere, level, state) for state in (STATE, far))
+    assert float(jnp.abs(here - there).max()) > 1e-2
+    shifted = replace(PARAMS, gate=replace(gate, mean=gate.mean + 1))
+    change = first_coefficients(shifted) - first_coefficients(PARAMS)
+    assert float(jnp.abs(change).max()) > 1e-2
+
+
+def test_jit_changes_nothing():
+    history = init(PARAMS, TERRAIN, STATE)
+    plain, plain_history = MODEL.step(PARAMS, TERRAIN, history, STATE, COMMAND)
+    found, found_history = step(PARAMS, TERRAIN, history, STATE, COMMAND)
+    np.testing.assert_allclose(found.vector, plain.vector, atol=2e-5)
+    np.testing.assert_allclose(found_history.hidden, plain_history.hidden, atol=1e-4)
+    np.testing.assert_allclose(found_history.coefficients, plain_history.coefficients, atol=1e-4)
+
+
+def test_a_batch_is_a_loop_and_one_trace_serves_all_drives():
+    traces = 0
+
+    @jax.jit
+    @jax.vmap
+    def together(state, commands):
+        nonlocal traces
+        traces += 1
+        return fuse(PARAMS, TERRAIN, state, commands)
+
+    states, controls = driving(2, 3), commands(12, 3)
+    batch, _ = together(states, controls)
+    together(driving(3, 3), commands(12, 3, seed=1))
+    assert traces == 1
+    for i in range(3):
+        state, control = jax.tree.map(lambda x: x[i], (states, controls))  # noqa: B023
+        one, _ = fused(PARAMS, TERRAIN, state, control)
+        np.testing.assert_allclose(batch.vector[i], one.vector, atol=1e-3)
+
+
+def test_proposals_reach_the_fused_state_but_not_the_gate_with_gradients():
+    history = init(PARAMS, TERRAIN, STATE)
+
+    @jax.jit
+    def along(direction):
+        def after(params):
+            state, history_ = MODEL.step(params, TERRAIN, history, STATE, COMMAND)
+            return state.vector, history_.coefficients
+
+        return jax.jvp(after, (PARAMS,), (direction,))[1]
+
+    still = jax.tree.map(jnp.zeros_like, PARAMS)
+    network = jax.tree.map(jnp.ones_like, PARAMS.transformer.network)
+    by_proposal = replace(still, transformer=replace(still.transformer, network=network))
+    network = jax.tree.map(jnp.ones_like, PARAMS.gate.network)
+    by_gate = replace(still, gate=replace(still.gate, network=network))
+    ones = jnp.ones_like(PARAMS.gate.mean)
+    by_constants = replace(still, gate=replace(still.gate, mean=ones, scale=ones))
+    moves = [[bool(np.any(x)) for x in along(d)] for d in (by_proposal, by_gate, by_constants)]
+    assert moves == [[True, False], [True, True], [False, False]]
+
+
+def test_gate_learns_through_time_with_finite_gradients():
+    """Sixteen steps, through the fused states as well as the gate's memory."""
+    history, control = init(PARAMS, TERRAIN, STATE), commands(16, seed=2)
+
+    def loss(gate, state):
+        states = rollout(MODEL, replace(PARAMS, gate=gate), TERRAIN, history, state, control)
+        return jnp.sum((states.position[-1] - 3.0) ** 2)
+
+    by_gate, by_state = jax.jit(jax.grad(loss, argnums=(0, 1)))(PARAMS.gate, STATE)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((by_gate, by_state)))
+    assert all(np.any(x) for x in jax.tree.leaves(by_gate.network))
+    assert np.any(by_state.velocity)

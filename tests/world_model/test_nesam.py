@@ -1,0 +1,248 @@
+from dataclasses import dataclass, replace
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import expm
+from world_model.examples import CONSTANTS, TINY, commands, count, driving, moved, rough
+
+from vertiwm_jax.dynamics import rollout
+from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.state import VehicleState
+from vertiwm_jax.terrain import query
+from vertiwm_jax.world_model import motion
+from vertiwm_jax.world_model.nesam import WINDOW, Nesam, calibrate, corrected, difference
+from vertiwm_jax.world_model.sizes import BASE
+
+KEY, TERRAIN = jax.random.key(0), rough()
+PHYSICS = chrono_like(hmmwv())
+MODEL = Nesam(TINY)
+SCALE = 0.1 * CONSTANTS.transition_deviation
+UNTRAINED = replace(MODEL.init_params(KEY, PHYSICS, CONSTANTS), correction_scale=SCALE)
+PARAMS = moved(UNTRAINED)
+KEEPS = jnp.linspace(0.9, 0.4, 6)
+"""Share of each velocity that is left after a step of `Damped`."""
+
+
+@dataclass(frozen=True)
+class Damped(Simulator):
+    """Physics that compiles in no time, and whose response to velocities is known."""
+
+    def step(self, params, terrain, history, state, command):
+        before = motion.twist(state)
+        after = KEEPS * before + 0.1 * command.speed * jnp.eye(6)[0]
+        increment = 0.1 * (0.7 * before + 0.3 * after)
+        memory = replace(
+            history,
+            wheel_speed=0.5 * history.wheel_speed + command.speed,
+            sinkage=0.5 * history.sinkage + 0.1,
+            steering=command.steering,
+        )
+        return motion.moved(state, increment, after), memory
+
+
+SIMPLE = replace(MODEL, simulator=Damped())
+READING = replace(SIMPLE, reads_patches=True)
+
+
+def standing(seed: int = 0, *batch: int) -> VehicleState:
+    """As `driving`, with the wheels about on the ground."""
+    state = driving(seed, *batch)
+    ground = query.height(TERRAIN, state.position[..., :2])
+    return replace(state, position=state.position.at[..., 2].set(ground + 0.5))
+
+
+def predict(model, params, state, control, terrain=TERRAIN):
+    history = model.init(params, terrain, state)
+    return rollout(model, params, terrain, history, state, control)
+
+
+@cache
+def compiled(model):
+    """Most tests share one program a model: compiling the simulator takes seconds."""
+    return (
+        jax.jit(partial(predict, model))
+        .lower(PARAMS if isinstance(model, Nesam) else PHYSICS, standing(), commands(16), TERRAIN)
+        .compile()
+    )
+
+
+def predicted(model, params, state, control, terrain=TERRAIN):
+    """The 16 states after `state`."""
+    return compiled(model)(params, state, control, terrain)
+
+
+def one(states, i):
+    return jax.tree.map(lambda x: x[i], states)
+
+
+def test_base_size():
+    parameters = jax.eval_shape(Nesam(BASE).init_params, KEY, PHYSICS)
+    assert 400_000 < count(parameters.network) < 700_000
+
+
+def test_a_rollout_leaves_out_encoders_that_nobody_reads():
+    looking = jax.jit(MODEL.init).lower(PARAMS, TERRAIN, standing()).compile()
+    assert "convolution" in str(looking.as_text())
+    assert "convolution" not in str(compiled(MODEL).as_text())
+
+
+def test_untrained_is_the_simulator():
+    state, control = standing(), commands(16)
+    expected = predicted(Simulator(), PHYSICS, state, control)
+    found = predicted(MODEL, UNTRAINED, state, control)
+    assert float(jnp.abs(expected.position[-1] - state.position).max()) > 1
+    np.testing.assert_allclose(found.vector, expected.vector, atol=3e-4)
+    alone = predicted(replace(MODEL, residual=False), PARAMS, state, control)
+    np.testing.assert_allclose(alone.vector, expected.vector, atol=3e-4)
+
+
+def test_a_correction_moves_the_proposal_along_the_tangent():
+    """Against SciPy's matrix exponential of the twist, in double precision."""
+    state = standing()
+    rng = np.random.default_rng(1)
+    for size in (1e-3, 0.1, 1.0):
+        correction = (size * rng.uniform(-1, 1, 12)).astype(np.float32)
+        (x, y, z), (a, b, c) = correction[:3].astype(float), correction[3:6].astype(float)
+        generator = np.array([[0, -c, b, x], [c, 0, -a, y], [-b, a, 0, z], [0, 0, 0, 0]])
+        expected = np.asarray(state.pose.as_matrix(), np.float64) @ expm(generator)
+        found = corrected(state, jnp.asarray(correction))
+        np.testing.assert_allclose(found.pose.as_matrix(), expected, atol=3e-6)
+        np.testing.assert_allclose(found.velocity, state.velocity + correction[6:9], atol=1e-6)
+        rates = state.angular_velocity + correction[9:]
+        np.testing.assert_allclose(found.angular_velocity, rates, atol=1e-6)
+        np.testing.assert_allclose(difference(state, found), correction, atol=3e-6)
+
+
+def test_step_adds_what_the_network_says_in_its_scale():
+    state, control = standing(), commands(16)
+    # With a bias alone, the output of the network is that bias.
+    network = jax.tree.map(lambda x: x, UNTRAINED.network)
+    network["params"]["head"]["bias"] = bias = jnp.linspace(-1, 1, 12)
+    found = predicted(MODEL, replace(UNTRAINED, network=network), state, control)
+    physics = predicted(Simulator(), PHYSICS, state, control)
+    expected = corrected(one(physics, 0), SCALE * bias)
+    np.testing.assert_allclose(one(found, 0).vector, expected.vector, atol=1e-5)
+
+
+def test_cached_steps_along_a_drive_equal_the_whole_sequence():
+    steps = WINDOW + 5
+    drive, control = standing(1, steps), commands(steps)
+    params = READING.init_params(KEY, PHYSICS, CONSTANTS)
+    untrained = replace(params, correction_scale=SCALE)
+    params = moved(untrained)
+
+    @jax.jit
+    def cached(params, states, commands):
+        def advance(carry, inputs):
+            state, command = inputs
+            # Recorded states do not follow from each other as predicted ones do.
+            patches = READING.exteroception.query(TERRAIN, state)
+            seeing = replace(carry, perception=READING.perceive(params, patches))
+            proposed, history = READING.propose(params, TERRAIN, seeing, state, command)
+            return history, proposed
+
+        start = READING.init(params, TERRAIN, one(states, 0))
+        return jax.lax.scan(advance, start, (states, commands))[1]
+
+    follow = jax.jit(READING.follow)
+    at_once = follow(params, TERRAIN, drive, control)
+    physics = follow(untrained, TERRAIN, drive, control)
+    assert float(jnp.abs(physics.velocity - at_once.velocity).max(-1).min()) > 1e-3
+    one_by_one = cached(params, drive, control)
+    np.testing.assert_allclose(one_by_one.vector, at_once.vector, atol=1e-4)
+
+
+def test_place_and_heading_do_not_matter():
+    """The same hills elsewhere, and a vehicle on them that starts there."""
+    state, control = standing(), commands(16)
+    shift = jnp.array([10.0, -20.0, 3.0])
+    elsewhere = replace(rough(lift=3.0), origin=TERRAIN.origin + shift[:2])
+    there = replace(state, position=state.position + shift)
+    found = predicted(MODEL, PARAMS, there, control, elsewhere)
+    expected = predicted(MODEL, PARAMS, state, control)
+    np.testing.assert_allclose(found.position - shift, expected.position, atol=5e-3)
+    np.testing.assert_allclose(found.rpy, expected.rpy, atol=5e-3)
+
+
+def test_gradients_reach_all_weights_through_sixteen_steps():
+    params = replace(PARAMS, response=-0.4 * jnp.eye(12, 6, -6))
+    state, control = standing(3), commands(16)
+
+    def loss(network):
+        final = one(predict(MODEL, replace(params, network=network), state, control), -1)
+        return jnp.sum(final.vector)
+
+    gradients = jax.jit(jax.grad(loss))(PARAMS.network)
+    for path, leaf in jax.tree.leaves_with_path(gradients):
+        assert bool(jnp.isfinite(leaf).all()), path
+        assert float(jnp.abs(leaf).max()) > 0, path
+
+
+def test_calibration_measures_what_physics_misses_and_how_it_answers():
+    drives, steps = 6, 16
+    starts, control = standing(5, drives), commands(steps, drives)
+    after = jax.vmap(lambda state, u: predict(Damped(), PHYSICS, state, u))(starts, control)
+    states = jax.tree.map(lambda a, b: jnp.concatenate([a[:, None], b], 1), starts, after)
+    worlds = replace(TERRAIN, world=jnp.zeros(drives, jnp.int32))
+    measured = jax.jit(lambda *drive: calibrate(SIMPLE, UNTRAINED, worlds, *drive))
+    params = measured(states, control)
+    np.testing.assert_allclose(params.correction_scale, 0, atol=1e-4)
+    # The increment is 0.02 s times the loss of velocity more than that of the mean velocity.
+    change = np.diag(KEEPS - 1)
+    np.testing.assert_allclose(params.response, np.concatenate([-0.02 * change, change]), atol=1e-3)
+
+    error = 0.3 * (-1.0) ** jnp.arange(steps + 1)
+    off = replace(states, velocity=states.velocity.at[..., 0].add(error))
+    # An error, and 0.9 of the opposite one before it.
+    found = measured(off, control).correction_scale
+    np.testing.assert_allclose(found[6], 0.3 + 0.9 * 0.3, rtol=0.01)
+    np.testing.assert_allclose(found[9:], 0, atol=1e-4)
+
+
+def test_the_mean_gradient_is_exact_where_physics_answers_alike_everywhere():
+    change = jnp.diag(KEEPS - 1)
+    params = replace(PARAMS, response=jnp.concatenate([-0.02 * change, change]))
+    state, control = standing(3), commands(16)
+
+    def loss(network, model):
+        final = one(predict(model, replace(params, network=network), state, control), -1)
+        return jnp.sum(final.vector)
+
+    value = jax.jit(jax.value_and_grad(loss), static_argnums=1)
+    mean, by_mean = value(PARAMS.network, SIMPLE)
+    exact, by_exact = value(PARAMS.network, replace(SIMPLE, gradient="exact"))
+    np.testing.assert_allclose(mean, exact, rtol=1e-4)
+    for a, b in zip(*map(jax.tree.leaves, (by_mean, by_exact)), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-2 * float(jnp.abs(b).max()))
+
+
+def test_a_batch_is_a_loop_and_one_trace_serves_all_drives():
+    traces = 0
+
+    @jax.jit
+    @jax.vmap
+    def together(state, commands):
+        nonlocal traces
+        traces += 1
+        return predict(SIMPLE, PARAMS, state, commands)
+
+    states, controls = standing(2, 3), commands(16, 3)
+    batch = together(states, controls)
+    together(standing(3, 3), commands(16, 3, seed=1))
+    assert traces == 1
+    for i in range(3):
+        alone = predicted(SIMPLE, PARAMS, one(states, i), one(controls, i))
+        np.testing.assert_allclose(one(batch, i).vector, alone.vector, atol=1e-3)
+
+
+def test_jit_changes_nothing():
+    state, command = standing(), one(commands(1), 0)
+    plain = SIMPLE.init(PARAMS, TERRAIN, state)
+    found, history = jax.jit(SIMPLE.step)(PARAMS, TERRAIN, plain, state, command)
+    expected, following = SIMPLE.step(PARAMS, TERRAIN, plain, state, command)
+    np.testing.assert_allclose(found.vector, expected.vector, atol=1e-5)
+    for a, b in zip(*map(jax.tree.leaves, (history, following)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)

@@ -1,0 +1,175 @@
+"""Training of the terrain autoencoders to reconstruct patches of a collection's ground."""
+
+from dataclasses import dataclass
+from typing import Self, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from vertiwm_jax.dynamics import Params
+from vertiwm_jax.learning.dataset import Drives
+from vertiwm_jax.networks.encoder import TerrainAutoencoder
+from vertiwm_jax.state import Patches
+from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.query import PATCH_PIXELS, RELIEF_METRES, PatchConfig
+from vertiwm_jax.world_model.perception import EncoderParams
+
+_ELEVATION, _SEMANTIC = TerrainAutoencoder(1), TerrainAutoencoder(3)
+_NETWORKS = {"elevation": _ELEVATION, "semantic": _SEMANTIC}
+
+
+@dataclass(frozen=True)
+class AutoencoderConfig:
+    """Which patches a pair of autoencoders is trained on."""
+
+    patches: PatchConfig = PatchConfig("vehicle", "bilinear")
+    """How heights become patches; models that use the encoders must use the same."""
+    batch: int = 64
+    """Patches in a batch."""
+    offset: float = 20.0
+    """How far from a recorded place patches are taken, m, along x and y; their yaw is any."""
+    validation: int = 512
+    """Patches to validate on, at recorded poses."""
+
+    def __post_init__(self):
+        for name in ("batch", "validation"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
+        if self.offset < 0:
+            raise ValueError(f"offset: expected at least 0 m, found {self.offset}")
+
+
+@struct.dataclass
+class Places:
+    """P recorded places of vehicles. position: `[P, 3]` m; yaw: `[P]` rad; world: `[P]`."""
+
+    position: jax.Array
+    yaw: jax.Array
+    world: jax.Array
+
+    @classmethod
+    def of(cls, drives: Drives) -> Self:
+        """All valid ones."""
+        valid = np.arange(drives.state.shape[1]) <= np.asarray(drives.length)[:, None]
+        state = np.asarray(drives.state)[valid]
+        world = np.broadcast_to(np.asarray(drives.world)[:, None], valid.shape)[valid]
+        return cls(*map(jnp.asarray, (state[:, :3], state[:, 5], world)))
+
+
+@struct.dataclass
+class PatchData:
+    """Places to train on and to validate on, with their ground."""
+
+    places: Places
+    terrain: TerrainMap
+    validation: Places
+    validation_terrain: TerrainMap
+
+    @classmethod
+    def of(
+        cls,
+        config: AutoencoderConfig,
+        training: tuple[Drives, TerrainMap],
+        validation: tuple[Drives, TerrainMap],
+    ) -> Self:
+        """All places of the training drives, and `config.validation` of the validation drives."""
+        held_out = Places.of(validation[0])
+        rows = np.linspace(0, len(held_out.yaw) - 1, config.validation).astype(int)
+        some = jax.tree.map(lambda x: x[rows], held_out)
+        return cls(Places.of(training[0]), training[1], some, validation[1])
+
+
+@dataclass(frozen=True)
+class AutoencoderProblem:
+    """A `fitting.Problem`: the squared error of reconstructed elevations and colours."""
+
+    config: AutoencoderConfig
+
+    def init_params(self, key: jax.Array) -> Params:
+        """Untrained networks `elevation` and `semantic`."""
+        keys = dict(zip(_NETWORKS, jax.random.split(key), strict=True))
+        pixels = PATCH_PIXELS, PATCH_PIXELS
+        return {
+            name: network.init(keys[name], jnp.zeros((*pixels, network.channels)))
+            for name, network in _NETWORKS.items()
+        }
+
+    def loss(self, params: Params, data: PatchData, key: jax.Array) -> jax.Array:
+        """The mean squared error `[]` of both, on patches near recorded places."""
+        row_key, offset_key, yaw_key = jax.random.split(key, 3)
+        batch = self.config.batch
+        rows = jax.random.randint(row_key, (batch,), 0, len(data.places.yaw))
+        places = jax.tree.map(lambda x: x[rows], data.places)
+        offset = self.config.offset * jax.random.uniform(offset_key, (batch, 2), minval=-1.0)
+        yaw = jax.random.uniform(yaw_key, (batch,), minval=-jnp.pi, maxval=jnp.pi)
+
+        def one(place: Places, offset: jax.Array, yaw: jax.Array) -> jax.Array:
+            terrain = data.terrain.select(place.world)
+            position = _move(terrain, place.position, offset)
+            patches = query.patches(terrain, position, yaw, self.config.patches)
+            again = reconstruct(params, patches)
+            elevation = jnp.mean((again.elevation - patches.elevation) ** 2)
+            return elevation + jnp.mean((again.rgb - patches.rgb) ** 2)
+
+        return jnp.mean(jax.vmap(one)(places, offset, yaw))
+
+    def validate(self, params: Params, data: PatchData) -> dict[str, jax.Array]:
+        """Errors of reconstruction at recorded poses; `error` is the loss there.
+
+        elevation_rms: m, of heights as the patch has them, within its limits. colour_accuracy:
+        share of the pixels whose reconstructed colour is nearest to that of their own class.
+        """
+        terrain, config = data.validation_terrain, self.config
+        palette = terrain.class_rgb.astype(jnp.float32) / 127.5 - 1
+
+        def nearest(rgb: jax.Array) -> jax.Array:
+            return jnp.argmin(jnp.sum((rgb[..., None, :] - palette) ** 2, axis=-1), axis=-1)
+
+        def one(place: Places) -> tuple[jax.Array, ...]:
+            world = terrain.select(place.world)
+            patches = query.patches(world, place.position, place.yaw, config.patches)
+            again = reconstruct(params, patches)
+            elevation = jnp.mean((again.elevation - patches.elevation) ** 2)
+            colour = jnp.mean((again.rgb - patches.rgb) ** 2)
+            return elevation, colour, jnp.mean(nearest(again.rgb) == nearest(patches.rgb))
+
+        means = jax.lax.map(one, data.validation, batch_size=config.batch)
+        elevation, colour, accuracy = map(jnp.mean, means)
+        return {
+            "elevation_rms": _metres(terrain, config.patches) * jnp.sqrt(elevation),
+            "colour_accuracy": accuracy,
+            "error": elevation + colour,
+        }
+
+
+def encoders(params: Params) -> EncoderParams:
+    """The encoders of a pair of autoencoders, without the decoders."""
+    return EncoderParams(
+        **{name: {"params": params[name]["params"]["encoder"]} for name in _NETWORKS}
+    )
+
+
+def reconstruct(params: Params, patches: Patches) -> Patches:
+    """Patches after encoding and decoding."""
+    elevation = _ELEVATION.apply(params["elevation"], patches.elevation[..., None])
+    rgb = _SEMANTIC.apply(params["semantic"], patches.rgb)
+    return Patches(cast(jax.Array, elevation)[..., 0], cast(jax.Array, rgb))
+
+
+def _move(terrain: TerrainMap, position: jax.Array, offset: jax.Array) -> jax.Array:
+    """A position `[3]` moved by `[2]` m on the map, as high above the ground as it was."""
+    rows, columns = terrain.elevation.shape[1:]
+    extent = terrain.resolution * jnp.array([columns - 1.0, 1.0 - rows])
+    corners = jnp.stack([terrain.origin, terrain.origin + extent])
+    xy = jnp.clip(position[:2] + offset, corners.min(axis=0), corners.max(axis=0))
+    above = position[2] - query.height(terrain, position[:2])
+    return jnp.append(xy, query.height(terrain, xy) + above)
+
+
+def _metres(terrain: TerrainMap, config: PatchConfig) -> jax.Array | float:
+    """Metres of height that are 1 in a patch."""
+    low, high = terrain.elevation_range
+    return RELIEF_METRES if config.reference == "vehicle" else 0.5 * (high - low)

@@ -1,0 +1,229 @@
+"""Fitting dynamics to windows of recorded drives: by open-loop rollouts, or step by step."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, Self, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from vertiwm_jax.dynamics import Dynamics, History, Params, warm_up
+from vertiwm_jax.learning import augment, windows
+from vertiwm_jax.learning.dataset import Drives
+from vertiwm_jax.learning.losses import LossConfig, step_loss, trajectory_loss
+from vertiwm_jax.learning.windows import GROUNDS, WindowIndex, Windows
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain.map import TerrainMap
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class WindowConfig:
+    """Which windows a model is fitted to and validated on."""
+
+    batch: int = 64
+    """Windows in a batch."""
+    context: int = 16
+    """Recorded steps that a model sees first."""
+    horizon: int = 16
+    """Steps that it predicts."""
+    stride: int = 4
+    """Steps from one window to the next."""
+    weights: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """How often a window on rigid ground, on soil and across both is drawn, relatively."""
+    mirror: bool = True
+    """Whether half of those drawn are replaced by their mirror images."""
+    validation: int = 256
+    """Largest number of windows of each kind of ground to validate on."""
+
+    def __post_init__(self):
+        least = {"batch": 1, "context": 0, "horizon": 1, "stride": 1, "validation": 1}
+        for name, lowest in least.items():
+            if getattr(self, name) < lowest:
+                raise ValueError(f"{name}: expected at least {lowest}, found {getattr(self, name)}")
+        if min(self.weights) < 0:
+            raise ValueError(f"weights: expected at least 0, found {self.weights}")
+
+
+@struct.dataclass
+class WindowData:
+    """Windows to fit to, and others to validate on, with their ground.
+
+    drives, index: where the N windows lie; share: `[N]` the chance that a window or one before it
+    is drawn; terrain: with the mirror images of its worlds if windows are mirrored.
+    """
+
+    drives: Drives
+    index: WindowIndex
+    share: jax.Array
+    terrain: TerrainMap
+    validation: Windows
+    validation_terrain: TerrainMap
+
+    @classmethod
+    def of(
+        cls,
+        config: WindowConfig,
+        training: tuple[Drives, TerrainMap],
+        validation: tuple[Drives, TerrainMap],
+    ) -> Self:
+        """All windows of the training drives, and some of the validation drives.
+
+        Raises `DataError` when drives are too short, `MapError` when maps cannot be mirrored,
+        `ValueError` when no window has a chance to be drawn.
+        """
+        lengths = config.context, config.horizon, config.stride
+        index = windows.index(*training, *lengths)
+        chance = np.asarray(config.weights)[np.asarray(index.ground)].cumsum()
+        if chance[-1] == 0:
+            raise ValueError("weights: expected one above 0 of the ground driven on, found none")
+        drives, terrain = training
+        held_out = windows.index(*validation, *lengths)
+        rows = _spread(np.asarray(held_out.ground), config.validation)
+        return cls(
+            drives=jax.device_put(drives),
+            index=index,
+            share=jnp.asarray(chance / chance[-1], jnp.float32),
+            terrain=augment.with_mirrored(terrain) if config.mirror else terrain,
+            validation=windows.gather(validation[0], _at(held_out, rows)),
+            validation_terrain=validation[1],
+        )
+
+
+class Objective(Protocol):
+    """The loss of one window, its leaves without the axis N, on its own world."""
+
+    def __call__(self, params: Params, terrain: TerrainMap, window: Windows) -> jax.Array: ...
+
+
+@dataclass(frozen=True)
+class OpenLoop:
+    """Eq. 11: the model sees the recorded context, then only commands and its own predictions.
+
+    coefficients: reads the `[4]` fusion coefficients of a step from the history after it.
+    """
+
+    dynamics: Dynamics
+    loss: LossConfig = LossConfig()
+    coefficients: Callable[[History], jax.Array] | None = None
+
+    def __call__(self, params: Params, terrain: TerrainMap, window: Windows) -> jax.Array:
+        read = self.coefficients or (lambda _: None)
+        predicted, coefficients = open_loop(self.dynamics, params, terrain, window, read)
+        recorded = VehicleState.from_vector(window.state[window.context + 1 :])
+        return trajectory_loss(self.loss, predicted, recorded, coefficients)
+
+
+class Follower(Dynamics, Protocol):
+    """A `Dynamics` that can take a step from every recorded state at once."""
+
+    def follow(
+        self, params: Params, terrain: TerrainMap, states: VehicleState, commands: Command
+    ) -> VehicleState:
+        """What follows each of T states, leaves `[T, 3]`, by the history of those before it."""
+        ...
+
+
+@dataclass(frozen=True)
+class OneStep:
+    """The mean loss of single steps, each from the recorded state; the context is one of them.
+
+    deviation: twelve, of transitions over drives; see `normalisation.measure`.
+    """
+
+    dynamics: Follower
+    deviation: tuple[float, ...]
+
+    def __call__(self, params: Params, terrain: TerrainMap, window: Windows) -> jax.Array:
+        recorded = VehicleState.from_vector(window.state)
+        before, after = _at(recorded, slice(None, -1)), _at(recorded, slice(1, None))
+        commands = Command.from_vector(window.control)
+        predicted = self.dynamics.follow(params, terrain, before, commands)
+        return jnp.mean(step_loss(jnp.asarray(self.deviation), before, predicted, after))
+
+
+@dataclass(frozen=True)
+class WindowProblem:
+    """A `fitting.Problem`: parameters of `dynamics` that keep `objective` small on windows.
+
+    Validated is the mean position error, m, after the last step of open-loop predictions by kind
+    of ground; `error` is the mean over the kinds.
+    """
+
+    dynamics: Dynamics
+    objective: Objective
+    config: WindowConfig
+
+    def loss(self, params: Params, data: WindowData, key: jax.Array) -> jax.Array:
+        """The mean objective `[]` of a batch of windows."""
+        draw_key, mirror_key = jax.random.split(key)
+        uniform = jax.random.uniform(draw_key, (self.config.batch,))
+        rows = jnp.searchsorted(data.share, uniform, side="right")
+        batch = windows.gather(data.drives, _at(data.index, rows))
+        if self.config.mirror:
+            batch = augment.mirror_some(mirror_key, batch, data.terrain)
+
+        def one(window: Windows) -> jax.Array:
+            return self.objective(params, data.terrain.select(window.world), window)
+
+        return jnp.mean(jax.vmap(one)(batch))
+
+    def validate(self, params: Params, data: WindowData) -> dict[str, jax.Array]:
+        """Position errors, m; a prediction that is not finite counts as not having moved."""
+
+        def one(window: Windows) -> tuple[jax.Array, jax.Array]:
+            terrain = data.validation_terrain.select(window.world)
+            predicted, _ = open_loop(self.dynamics, params, terrain, window, lambda _: None)
+            truth, start = window.state[-1, :3], window.state[window.context, :3]
+            error = jnp.linalg.norm(predicted.position[-1] - truth)
+            lost = ~jnp.isfinite(error)
+            return jnp.where(lost, jnp.linalg.norm(start - truth), error), lost
+
+        error, lost = jax.lax.map(one, data.validation, batch_size=self.config.batch)
+        kinds = data.validation.ground == jnp.arange(len(GROUNDS))[:, None]
+        means = jnp.sum(kinds * error, axis=1) / jnp.sum(kinds, axis=1)
+        by_kind = {f"error_{kind}": mean for kind, mean in zip(GROUNDS, means, strict=True)}
+        return {**by_kind, "error": jnp.nanmean(means), "diverged": jnp.mean(lost)}
+
+
+def open_loop(
+    dynamics: Dynamics,
+    params: Params,
+    terrain: TerrainMap,
+    window: Windows,
+    read: Callable[[History], T],
+) -> tuple[VehicleState, T]:
+    """The K states predicted in one window, leaves `[K, 3]`, and what is read of the histories.
+
+    The history is warmed up on the recorded context; from its last state on, the model sees its
+    own predictions and the recorded commands.
+    """
+    c = window.context
+    recorded, commands = VehicleState.from_vector(window.state), Command.from_vector(window.control)
+    context, start = _at(recorded, slice(c + 1)), _at(recorded, c)
+    history = warm_up(dynamics, params, terrain, context, _at(commands, slice(c)))
+
+    def advance(
+        carry: tuple[VehicleState, History], command: Command
+    ) -> tuple[tuple[VehicleState, History], tuple[VehicleState, T]]:
+        state, history = dynamics.step(params, terrain, carry[1], carry[0], command)
+        return (state, history), (state, read(history))
+
+    return jax.lax.scan(advance, (start, history), _at(commands, slice(c, None)))[1]
+
+
+def _at(tree: T, place: Any) -> T:
+    """A pytree with every leaf indexed."""
+    return jax.tree.map(lambda x: x[place], tree)
+
+
+def _spread(ground: np.ndarray, most: int) -> np.ndarray:
+    """Rows of at most `most` windows of each kind, evenly spread over all of them, in order."""
+    rows = []
+    for kind in range(len(GROUNDS)):
+        found = np.flatnonzero(ground == kind)
+        rows.append(found[np.linspace(0, len(found) - 1, min(most, len(found))).astype(int)])
+    return np.sort(np.concatenate(rows))

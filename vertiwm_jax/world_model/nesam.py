@@ -1,0 +1,337 @@
+"""F_N, NeSAM: the simulator's mechanics and a causal Transformer that corrects them (Sec. IV-B)."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, cast
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from vertiwm_jax.mechanics.simulator import Simulator, SimulatorHistory, SimulatorParams
+from vertiwm_jax.networks.encoder import LATENT_CHANNELS
+from vertiwm_jax.networks.transformer import KeyValueCache, Transformer
+from vertiwm_jax.state import Command, Patches, VehicleState
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model import motion
+from vertiwm_jax.world_model.normalisation import LOCAL, Normalisation
+from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception
+from vertiwm_jax.world_model.sizes import BASE, TransformerSize
+
+WINDOW = 16
+"""Tokens that F_N remembers, of 0.1 s each."""
+FEATURES = LOCAL.size + 2 + 12 + 12 + 15
+"""Of a token besides the ground: state, command, proposal, last error, memory of physics."""
+LARGEST_INPUT = 8.0
+"""Where inputs of the network are cut off, lest a crash blind it for a whole window."""
+TRAVEL, SINKAGE = 0.05, 0.1
+"""Typical travel of a wheel, and typical depth of a track in soil, m."""
+NUDGE = 0.05
+"""Change of velocities, m/s and rad/s, by which `calibrate` measures how physics answers."""
+
+
+@struct.dataclass
+class NesamParams:
+    """network: what is learned; encoders: frozen by default.
+
+    correction_scale: `[12]` root mean square of what physics misses in a step (`difference`).
+    response: `[12, 6]` change of a proposed `motion.transition` per change of the velocities that
+        it starts from, as physics typically has it.
+    Both are measured by `calibrate`, and never learned.
+    """
+
+    network: Any
+    encoders: EncoderParams
+    simulator: SimulatorParams
+    normalisation: Normalisation
+    correction_scale: jax.Array
+    response: jax.Array
+
+
+@struct.dataclass
+class NesamHistory:
+    """simulator: physical memory; cache: of the past tokens, None without the correction.
+
+    physics: what physics alone had made of the current state, which tells what it missed.
+    perception: of the current state.
+    """
+
+    simulator: SimulatorHistory
+    cache: KeyValueCache | None
+    physics: VehicleState
+    perception: Perception
+
+
+class _Network(nn.Module):
+    """Features of tokens, and what is seen of the ground, to corrections in their scale."""
+
+    size: TransformerSize
+
+    def setup(self) -> None:
+        size = self.size
+        self.embed = nn.Dense(size.width)
+        self.reduce = nn.Dense(size.channels)
+        self.embed_ground = nn.Dense(size.width, use_bias=False)
+        self.transformer = Transformer(size.layers, size.width, size.heads, size.hidden, WINDOW)
+        # Untrained, it leaves physics as it is.
+        self.head = nn.Dense(12, kernel_init=nn.initializers.zeros)
+
+    def __call__(self, features: jax.Array, ground: jax.Array | None) -> jax.Array:
+        """`[..., T, FEATURES]` and latents `[..., T, 16, 16, 36]` to `[..., T, 12]`."""
+        return self.head(self.transformer(self._tokens(features, ground)))
+
+    def step(
+        self, features: jax.Array, ground: jax.Array | None, cache: KeyValueCache
+    ) -> tuple[jax.Array, KeyValueCache]:
+        """`[..., FEATURES]` and a latent `[..., 16, 16, 36]` to `[..., 12]`."""
+        token, cache = self.transformer.step(self._tokens(features, ground), cache)
+        return self.head(token), cache
+
+    def empty_cache(self) -> KeyValueCache:
+        return self.transformer.empty_cache()
+
+    def _tokens(self, features: jax.Array, ground: jax.Array | None) -> jax.Array:
+        tokens = self.embed(features)
+        if ground is None:
+            return tokens
+        reduced = self.reduce(ground).reshape(*tokens.shape[:-1], -1)
+        return tokens + self.embed_ground(reduced)
+
+
+@dataclass(frozen=True)
+class Nesam:
+    """The `Dynamics` F_N: a step of the simulator, whose next state is then corrected.
+
+    What it corrects depends on neither place, height nor heading.
+
+    residual: whether physics is corrected at all.
+    reads_patches: whether the correction sees encoded patches, beside what physics makes of the
+        ground. Without, learning needs no encoders: XLA leaves them out of a rollout that nobody
+        asks what it saw.
+    gradient: "exact" through the simulator; or "mean", several times cheaper, as if what it
+        proposes depended on the velocities alone, and on them linearly (`NesamParams.response`).
+        Values are the same.
+    exteroception: how it looks at patches.
+    """
+
+    size: TransformerSize = BASE
+    residual: bool = True
+    reads_patches: bool = False
+    gradient: Literal["exact", "mean"] = "mean"
+    exteroception: Exteroception = Exteroception()
+    simulator: Simulator = Simulator()
+
+    def init_params(
+        self,
+        key: jax.Array,
+        simulator: SimulatorParams,
+        normalisation: Normalisation | None = None,
+    ) -> NesamParams:
+        """Physics as it is, and a network that leaves it so; see `calibrate` before learning."""
+        encoder_key, network_key = jax.random.split(key)
+        ground = jnp.zeros((1, 16, 16, 2 * LATENT_CHANNELS)) if self.reads_patches else None
+        return NesamParams(
+            network=self._network.init(network_key, jnp.zeros((1, FEATURES)), ground),
+            encoders=self.exteroception.init_params(encoder_key),
+            simulator=simulator,
+            normalisation=normalisation or Normalisation.unit(),
+            correction_scale=jnp.ones(12),
+            response=jnp.zeros((12, 6)),
+        )
+
+    def init(self, params: NesamParams, terrain: TerrainMap, state: VehicleState) -> NesamHistory:
+        """The simulator's history, an empty cache and a look at the ground."""
+        empty = self._network.apply(params.network, method=_Network.empty_cache)
+        cache = cast(KeyValueCache, empty) if self.residual else None
+        memory = self.simulator.init(params.simulator, terrain, state)
+        return NesamHistory(memory, cache, state, self._look(params, terrain, state))
+
+    def step(
+        self,
+        params: NesamParams,
+        terrain: TerrainMap,
+        history: NesamHistory,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, NesamHistory]:
+        """The next state, and a look at the ground there."""
+        state, history = self.propose(params, terrain, history, state, command)
+        return state, replace(history, perception=self._look(params, terrain, state))
+
+    def propose(
+        self,
+        params: NesamParams,
+        terrain: TerrainMap,
+        history: NesamHistory,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, NesamHistory]:
+        """`step` up to the next state; `history.perception` is still that of `state`."""
+        physics, memory = self._physics(params, terrain, history.simulator, state, command)
+        following = replace(history, simulator=memory, physics=physics)
+        if not self.residual:
+            return physics, following
+        features = _features(params, history.physics, state, command, physics, memory)
+        ground = history.perception.latent if self.reads_patches else None
+        output, cache = cast(
+            tuple[jax.Array, KeyValueCache],
+            self._network.apply(
+                params.network, features, ground, history.cache, method=_Network.step
+            ),
+        )
+        correction = _fixed(params.correction_scale) * output
+        return corrected(physics, correction), replace(following, cache=cache)
+
+    def perceive(self, params: NesamParams, patches: Patches) -> Perception:
+        """The patches as its encoders see them."""
+        return self.exteroception.encode(params.encoders, patches)
+
+    def follow(
+        self,
+        params: NesamParams,
+        terrain: TerrainMap,
+        states: VehicleState,
+        commands: Command,
+    ) -> VehicleState:
+        """A step from every state of a recorded drive: leaves `[T, 3]`, commands `[T]`.
+
+        What `step` gives from each of them with the history of those before. Physics goes step by
+        step, without a gradient, and the network over all of them at once.
+        """
+        physics, memories = _fixed(self.physics_along(params, terrain, states, commands))
+        if not self.residual:
+            return physics
+        expected = jax.tree.map(lambda x, y: jnp.concatenate([x[:1], y[:-1]]), states, physics)
+        features = _features(params, expected, states, commands, physics, memories)
+        seen = jax.vmap(lambda state: self._look(params, terrain, state))(states)
+        ground = seen.latent if self.reads_patches else None
+        output = cast(jax.Array, self._network.apply(params.network, features, ground))
+        return corrected(physics, _fixed(params.correction_scale) * output)
+
+    def physics_along(
+        self,
+        params: NesamParams,
+        terrain: TerrainMap,
+        states: VehicleState,
+        commands: Command,
+    ) -> tuple[VehicleState, SimulatorHistory]:
+        """What physics alone proposes from every recorded state, and its memory after each.
+
+        Leaves `[T, 3]` and commands `[T]`; no weight enters, so a drive needs this only once.
+        """
+
+        def advance(memory: SimulatorHistory, inputs: tuple[VehicleState, Command]):
+            proposed, memory = self.simulator.step(params.simulator, terrain, memory, *inputs)
+            return memory, (proposed, memory)
+
+        first = jax.tree.map(lambda x: x[0], states)
+        memory = self.simulator.init(params.simulator, terrain, first)
+        return jax.lax.scan(advance, memory, (states, commands))[1]
+
+    @property
+    def _network(self) -> _Network:
+        return _Network(self.size)
+
+    def _look(self, params: NesamParams, terrain: TerrainMap, state: VehicleState) -> Perception:
+        return self.perceive(params, self.exteroception.query(terrain, state))
+
+    def _physics(
+        self,
+        params: NesamParams,
+        terrain: TerrainMap,
+        memory: SimulatorHistory,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, SimulatorHistory]:
+        """A step of the simulator, with the gradient that was asked for."""
+        if self.gradient == "exact":
+            return self.simulator.step(params.simulator, terrain, memory, state, command)
+        given = _fixed((params.simulator, terrain, memory, state, command))
+        proposed, memory = _fixed(self.simulator.step(*given))
+        start = given[3]
+        gained = motion.twist(state) - motion.twist(start)  # zero, but for its gradient
+        transition = motion.transition(start, proposed) + _fixed(params.response) @ gained
+        tracked = motion.advance(state, transition)
+        return jax.tree.map(lambda x, y: x + (y - _fixed(y)), proposed, tracked), memory
+
+
+def difference(expected: VehicleState, state: VehicleState) -> jax.Array:
+    """`[..., 12]` between states: increment in the first's body frame (m, rad), then velocities."""
+    change = motion.twist(state) - motion.twist(expected)
+    return jnp.concatenate([motion.increment(expected, state), change], axis=-1)
+
+
+def corrected(state: VehicleState, correction: jax.Array) -> VehicleState:
+    """A state moved by a `[..., 12]` correction: the inverse of `difference`."""
+    return motion.moved(state, correction[..., :6], motion.twist(state) + correction[..., 6:])
+
+
+def calibrate(
+    model: Nesam, params: NesamParams, terrain: TerrainMap, states: VehicleState, commands: Command
+) -> NesamParams:
+    """The parameters with `correction_scale` and `response` measured on recorded drives.
+
+    states: leaves `[N, T + 1, 3]` on the worlds `terrain.world` `[N]`; commands: leaves `[N, T]`.
+    """
+
+    def one(
+        world: jax.Array, states: VehicleState, commands: Command
+    ) -> tuple[jax.Array, jax.Array]:
+        ground = terrain.select(world)
+        before, after = (
+            jax.tree.map(lambda x, part=part: x[part], states)
+            for part in (slice(None, -1), slice(1, None))
+        )
+        proposed, memories = model.physics_along(params, ground, before, commands)
+        # The last but one memory goes with the last state.
+        memory = jax.tree.map(lambda x: x[-2], memories)
+        start, command = jax.tree.map(lambda x: x[-1], (before, commands))
+
+        def answer(twist: jax.Array) -> jax.Array:
+            moving = replace(start, velocity=twist[:3], angular_velocity=twist[3:])
+            later, _ = model.simulator.step(params.simulator, ground, memory, moving, command)
+            return motion.transition(moving, later)
+
+        # Differences over about what physics misses: at a point, contacts are either on or off.
+        nudges = NUDGE * jnp.concatenate([jnp.eye(6), -jnp.eye(6)])
+        above, below = jnp.split(jax.vmap(answer)(motion.twist(start) + nudges), 2)
+        return jax.vmap(difference)(proposed, after), (above - below).T / (2 * NUDGE)
+
+    missed, response = jax.vmap(one)(terrain.world, states, commands)
+    # A few crashes would make up most of the squares.
+    missed = jnp.abs(missed.reshape(-1, 12))
+    missed = jnp.minimum(missed, jnp.percentile(missed, 99.0, axis=0))
+    scale = jnp.sqrt(jnp.mean(missed**2, axis=0))
+    return replace(params, correction_scale=scale, response=jnp.median(response, axis=0))
+
+
+def _features(
+    params: NesamParams,
+    expected: VehicleState,
+    state: VehicleState,
+    command: Command,
+    physics: VehicleState,
+    memory: SimulatorHistory,
+) -> jax.Array:
+    """What the network reads, `[..., FEATURES]`, of any number of steps.
+
+    expected: what physics had made of `state`; physics, memory: what it makes of the next.
+    """
+    constants, vehicle = params.normalisation, _fixed(params.simulator.vehicle)
+    slip = vehicle.wheel_radius * memory.wheel_speed - physics.velocity[..., :1]
+    parts = [
+        constants.state(state.vector),
+        constants.command(command.vector),
+        motion.transition(state, physics) / _fixed(constants.transition_deviation),
+        difference(expected, state) / _fixed(params.correction_scale),
+        jnp.arcsinh(slip),
+        (memory.travel - vehicle.free_travel) / TRAVEL,
+        memory.steering[..., None] / vehicle.steering_limit,
+        memory.sinkage / SINKAGE,
+        memory.rut / SINKAGE,
+    ]
+    return jnp.clip(jnp.concatenate(parts, axis=-1), -LARGEST_INPUT, LARGEST_INPUT)
+
+
+def _fixed(tree: Any) -> Any:
+    return jax.lax.stop_gradient(tree)

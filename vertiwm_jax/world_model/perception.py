@@ -1,0 +1,105 @@
+"""What a model perceives of the ground at a pose: queried patches and their latents (Eq. 2)."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from vertiwm_jax.dynamics import Dynamics, History, Params
+from vertiwm_jax.networks.encoder import TerrainEncoder
+from vertiwm_jax.state import Command, Patches, VehicleState
+from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.query import PATCH_PIXELS, PatchConfig
+
+_ELEVATION, _SEMANTIC = TerrainEncoder(1), TerrainEncoder(3)
+
+
+@struct.dataclass
+class Perception:
+    """The latents of the patches at a pose, Z of Eq. 2.
+
+    elevation, semantic: `[..., 16, 16, 18]`; row 0 farthest ahead, column 0 farthest left.
+    """
+
+    elevation: jax.Array
+    semantic: jax.Array
+
+    @property
+    def latent(self) -> jax.Array:
+        """`[..., 16, 16, 36]` both, channel by channel; flat, it is z of Eq. 2."""
+        return jnp.concatenate([self.elevation, self.semantic], axis=-1)
+
+    @property
+    def averaged(self) -> jax.Array:
+        """`[..., 36]` the mean of every channel over space, e of Eq. 5."""
+        return jnp.mean(self.latent, axis=(-3, -2))
+
+
+@struct.dataclass
+class EncoderParams:
+    """Weights of a pair of `TerrainEncoder`s, for elevation and for semantic colours."""
+
+    elevation: Any
+    semantic: Any
+
+
+@dataclass(frozen=True)
+class Exteroception:
+    """How a model looks at the ground: which patches, and encoders of its own.
+
+    patches: relative to the vehicle and bilinear by default, which keeps centimetres of relief
+        and does not know of heights above sea level; `PatchConfig()` is the paper's.
+    tune_encoders: whether gradients reach the encoders, which are frozen otherwise.
+    """
+
+    patches: PatchConfig = PatchConfig("vehicle", "bilinear")
+    tune_encoders: bool = False
+
+    def init_params(self, key: jax.Array) -> EncoderParams:
+        """Untrained encoders."""
+        keys = jax.random.split(key)
+        patch = jnp.zeros((PATCH_PIXELS, PATCH_PIXELS, 3))
+        return EncoderParams(
+            _ELEVATION.init(keys[0], patch[..., :1]), _SEMANTIC.init(keys[1], patch)
+        )
+
+    def query(self, terrain: TerrainMap, state: VehicleState) -> Patches:
+        """The patches at one vehicle's pose, which counts as given: Q(M; sg(T))."""
+        return query.patches(terrain, state.position, state.rpy[2], self.patches)
+
+    def encode(self, params: EncoderParams, patches: Patches) -> Perception:
+        """Patches to their latents (Eq. 2)."""
+        if not self.tune_encoders:
+            params = jax.lax.stop_gradient(params)
+        elevation = _ELEVATION.apply(params.elevation, patches.elevation[..., None])
+        semantic = _SEMANTIC.apply(params.semantic, patches.rgb)
+        return Perception(cast(jax.Array, elevation), cast(jax.Array, semantic))
+
+
+class Specialist(Dynamics, Protocol):
+    """A `Dynamics` whose step is a proposal, and then a look at where it leads.
+
+    Its history has a field `perception` and can be changed with `dataclasses.replace`. The fused
+    model lets both specialists propose, fuses, and gives each its perception of the fused state.
+    """
+
+    @property
+    def exteroception(self) -> Exteroception: ...
+
+    def propose(
+        self,
+        params: Params,
+        terrain: TerrainMap,
+        history: History,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, History]:
+        """`step` up to the next state; `history.perception` is still that of `state`."""
+        ...
+
+    def perceive(self, params: Params, patches: Patches) -> Perception:
+        """The patches as this specialist's encoders see them."""
+        ...

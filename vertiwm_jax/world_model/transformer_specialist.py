@@ -1,0 +1,194 @@
+"""F_T: a causal Transformer over states, commands and encoded terrain (Sec. IV-B)."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, cast
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from vertiwm_jax.networks.encoder import LATENT_CHANNELS
+from vertiwm_jax.networks.transformer import KeyValueCache, Transformer
+from vertiwm_jax.state import Command, Patches, VehicleState
+from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model import motion
+from vertiwm_jax.world_model.normalisation import LOCAL, Normalisation
+from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception
+from vertiwm_jax.world_model.sizes import BASE, TransformerSize
+
+WINDOW = 16
+"""Tokens that F_T remembers, of 0.1 s each."""
+
+
+@struct.dataclass
+class TransformerParams:
+    """network: what is learned; encoders: frozen by default, None without terrain patches."""
+
+    network: Any
+    encoders: EncoderParams | None
+    normalisation: Normalisation
+
+
+@struct.dataclass
+class TransformerHistory:
+    """cache: of the past tokens; perception: of the current state, None without patches."""
+
+    cache: KeyValueCache
+    perception: Perception | None
+
+
+class _Network(nn.Module):
+    """Normalised states and commands, and what is known of the ground, to transitions."""
+
+    size: TransformerSize
+
+    def setup(self) -> None:
+        size = self.size
+        self.embed = nn.Dense(size.width)
+        self.reduce = nn.Dense(size.channels)
+        self.embed_ground = nn.Dense(size.width, use_bias=False)
+        self.transformer = Transformer(size.layers, size.width, size.heads, size.hidden, WINDOW)
+        # The first guess is the mean transition, which is close to constant velocity.
+        self.head = nn.Dense(12, kernel_init=nn.initializers.zeros)
+
+    def __call__(self, motion: jax.Array, ground: jax.Array | None) -> jax.Array:
+        """`[..., T, 10]` and the ground `[..., T, ...]` to `[..., T, 12]`, normalised."""
+        return self.head(self.transformer(self._tokens(motion, ground)))
+
+    def step(
+        self, motion: jax.Array, ground: jax.Array | None, cache: KeyValueCache
+    ) -> tuple[jax.Array, KeyValueCache]:
+        """`[..., 10]` and the ground `[..., ...]` to `[..., 12]`, the last of `__call__`."""
+        token, cache = self.transformer.step(self._tokens(motion, ground), cache)
+        return self.head(token), cache
+
+    def empty_cache(self) -> KeyValueCache:
+        return self.transformer.empty_cache()
+
+    def _tokens(self, motion: jax.Array, ground: jax.Array | None) -> jax.Array:
+        """ground: a latent `[..., 16, 16, 36]`, an indicator `[..., 1]`, or nothing."""
+        tokens = self.embed(motion)
+        if ground is None:
+            return tokens
+        if ground.shape[-1] == 2 * LATENT_CHANNELS:
+            ground = self.reduce(ground).reshape(*tokens.shape[:-1], -1)
+        return tokens + self.embed_ground(ground)
+
+
+@dataclass(frozen=True)
+class TransformerSpecialist:
+    """The `Dynamics` F_T; what it predicts depends on neither place, height nor heading.
+
+    terrain: what it is told of the ground at the pose: encoded "patches"; the "indicator" of
+        NRD (Zhang et al., 2026), 1 on soil and 0 on rigid ground; or "none".
+    exteroception: how it looks at patches.
+    """
+
+    size: TransformerSize = BASE
+    terrain: Literal["patches", "indicator", "none"] = "patches"
+    exteroception: Exteroception = Exteroception()
+
+    def init_params(
+        self, key: jax.Array, normalisation: Normalisation | None = None
+    ) -> TransformerParams:
+        """Untrained weights; without constants, quantities are left in their units."""
+        encoder_key, network_key = jax.random.split(key)
+        encoders, ground = None, None
+        if self.terrain == "patches":
+            encoders = self.exteroception.init_params(encoder_key)
+            ground = jnp.zeros((1, 16, 16, 2 * LATENT_CHANNELS))
+        elif self.terrain == "indicator":
+            ground = jnp.zeros((1, 1))
+        network = self._network.init(network_key, jnp.zeros((1, LOCAL.size + 2)), ground)
+        return TransformerParams(network, encoders, normalisation or Normalisation.unit())
+
+    def init(
+        self, params: TransformerParams, terrain: TerrainMap, state: VehicleState
+    ) -> TransformerHistory:
+        """An empty cache and a look at the ground."""
+        empty = self._network.apply(params.network, method=_Network.empty_cache)
+        perception = self._look(params, terrain, state)
+        return TransformerHistory(cast(KeyValueCache, empty), perception)
+
+    def step(
+        self,
+        params: TransformerParams,
+        terrain: TerrainMap,
+        history: TransformerHistory,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, TransformerHistory]:
+        """The next state, and a look at the ground there."""
+        state, history = self.propose(params, terrain, history, state, command)
+        return state, replace(history, perception=self._look(params, terrain, state))
+
+    def propose(
+        self,
+        params: TransformerParams,
+        terrain: TerrainMap,
+        history: TransformerHistory,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, TransformerHistory]:
+        """`step` up to the next state; `history.perception` is still that of `state`."""
+        inputs = self._inputs(params, terrain, state, command, history.perception)
+        output, cache = cast(
+            tuple[jax.Array, KeyValueCache],
+            self._network.apply(params.network, *inputs, history.cache, method=_Network.step),
+        )
+        proposed = motion.advance(state, params.normalisation.transition(output))
+        return proposed, replace(history, cache=cache)
+
+    def perceive(self, params: TransformerParams, patches: Patches) -> Perception:
+        """The patches as its encoders see them."""
+        assert params.encoders is not None, "F_T without terrain patches perceives nothing"
+        return self.exteroception.encode(params.encoders, patches)
+
+    def follow(
+        self,
+        params: TransformerParams,
+        terrain: TerrainMap,
+        states: VehicleState,
+        commands: Command,
+    ) -> VehicleState:
+        """A step from every state of a recorded drive: leaves `[T, 3]`, commands `[T]`.
+
+        What `step` gives from each of them with the history of those before, all at once.
+        """
+        perception = jax.vmap(lambda state: self._look(params, terrain, state))(states)
+        inputs = self._inputs(params, terrain, states, commands, perception)
+        output = cast(jax.Array, self._network.apply(params.network, *inputs))
+        return motion.advance(states, params.normalisation.transition(output))
+
+    @property
+    def _network(self) -> _Network:
+        return _Network(self.size)
+
+    def _look(
+        self, params: TransformerParams, terrain: TerrainMap, state: VehicleState
+    ) -> Perception | None:
+        if self.terrain != "patches":
+            return None
+        return self.perceive(params, self.exteroception.query(terrain, state))
+
+    def _inputs(
+        self,
+        params: TransformerParams,
+        terrain: TerrainMap,
+        state: VehicleState,
+        command: Command,
+        perception: Perception | None,
+    ) -> tuple[jax.Array, jax.Array | None]:
+        """What the network reads: motion `[..., 10]` and the ground."""
+        constants = params.normalisation
+        parts = constants.state(state.vector), constants.command(command.vector)
+        ground = None
+        if perception is not None:
+            ground = perception.latent
+        elif self.terrain == "indicator":
+            below = query.surface(terrain, state.position[..., :2])
+            soil = terrain.deformable[below.semantic]
+            ground = soil[..., None].astype(jnp.float32)
+        return jnp.concatenate(parts, axis=-1), ground
