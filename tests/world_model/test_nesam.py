@@ -13,8 +13,9 @@ from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.world_model import motion
-from vertiwm_jax.world_model.nesam import WINDOW, Nesam, calibrate, corrected, difference
+from vertiwm_jax.world_model.nesam import Nesam, calibrate, corrected, difference
 from vertiwm_jax.world_model.sizes import BASE
+from vertiwm_jax.world_model.specialist_network import WINDOW
 
 KEY, TERRAIN = jax.random.key(0), rough()
 PHYSICS = chrono_like(hmmwv())

@@ -11,7 +11,8 @@ from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.query import PatchConfig
 from vertiwm_jax.world_model.perception import Exteroception
 from vertiwm_jax.world_model.sizes import BASE, PAPER
-from vertiwm_jax.world_model.transformer_specialist import WINDOW, TransformerSpecialist
+from vertiwm_jax.world_model.specialist_network import WINDOW
+from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
 
 KEY, TERRAIN = jax.random.key(0), rough()
 MODELS = {kind: TransformerSpecialist(TINY, kind) for kind in ("patches", "indicator", "none")}

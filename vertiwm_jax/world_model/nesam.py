@@ -3,23 +3,21 @@
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.mechanics.simulator import Simulator, SimulatorHistory, SimulatorParams
 from vertiwm_jax.networks.encoder import LATENT_CHANNELS
-from vertiwm_jax.networks.transformer import KeyValueCache, Transformer
+from vertiwm_jax.networks.transformer import KeyValueCache
 from vertiwm_jax.state import Command, Patches, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.normalisation import LOCAL, Normalisation
 from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception
 from vertiwm_jax.world_model.sizes import BASE, TransformerSize
+from vertiwm_jax.world_model.specialist_network import SpecialistNetwork
 
-WINDOW = 16
-"""Tokens that F_N remembers, of 0.1 s each."""
 FEATURES = LOCAL.size + 2 + 12 + 12 + 15
 """Of a token besides the ground: state, command, proposal, last error, memory of physics."""
 LARGEST_INPUT = 8.0
@@ -60,42 +58,6 @@ class NesamHistory:
     cache: KeyValueCache | None
     physics: VehicleState
     perception: Perception
-
-
-class _Network(nn.Module):
-    """Features of tokens, and what is seen of the ground, to corrections in their scale."""
-
-    size: TransformerSize
-
-    def setup(self) -> None:
-        size = self.size
-        self.embed = nn.Dense(size.width)
-        self.reduce = nn.Dense(size.channels)
-        self.embed_ground = nn.Dense(size.width, use_bias=False)
-        self.transformer = Transformer(size.layers, size.width, size.heads, size.hidden, WINDOW)
-        # Untrained, it leaves physics as it is.
-        self.head = nn.Dense(12, kernel_init=nn.initializers.zeros)
-
-    def __call__(self, features: jax.Array, ground: jax.Array | None) -> jax.Array:
-        """`[..., T, FEATURES]` and latents `[..., T, 16, 16, 36]` to `[..., T, 12]`."""
-        return self.head(self.transformer(self._tokens(features, ground)))
-
-    def step(
-        self, features: jax.Array, ground: jax.Array | None, cache: KeyValueCache
-    ) -> tuple[jax.Array, KeyValueCache]:
-        """`[..., FEATURES]` and a latent `[..., 16, 16, 36]` to `[..., 12]`."""
-        token, cache = self.transformer.step(self._tokens(features, ground), cache)
-        return self.head(token), cache
-
-    def empty_cache(self) -> KeyValueCache:
-        return self.transformer.empty_cache()
-
-    def _tokens(self, features: jax.Array, ground: jax.Array | None) -> jax.Array:
-        tokens = self.embed(features)
-        if ground is None:
-            return tokens
-        reduced = self.reduce(ground).reshape(*tokens.shape[:-1], -1)
-        return tokens + self.embed_ground(reduced)
 
 
 @dataclass(frozen=True)
@@ -141,7 +103,7 @@ class Nesam:
 
     def init(self, params: NesamParams, terrain: TerrainMap, state: VehicleState) -> NesamHistory:
         """The simulator's history, an empty cache and a look at the ground."""
-        empty = self._network.apply(params.network, method=_Network.empty_cache)
+        empty = self._network.apply(params.network, method=SpecialistNetwork.empty_cache)
         cache = cast(KeyValueCache, empty) if self.residual else None
         memory = self.simulator.init(params.simulator, terrain, state)
         return NesamHistory(memory, cache, state, self._look(params, terrain, state))
@@ -176,7 +138,7 @@ class Nesam:
         output, cache = cast(
             tuple[jax.Array, KeyValueCache],
             self._network.apply(
-                params.network, features, ground, history.cache, method=_Network.step
+                params.network, features, ground, history.cache, method=SpecialistNetwork.step
             ),
         )
         correction = _fixed(params.correction_scale) * output
@@ -229,8 +191,8 @@ class Nesam:
         return jax.lax.scan(advance, memory, (states, commands))[1]
 
     @property
-    def _network(self) -> _Network:
-        return _Network(self.size)
+    def _network(self) -> SpecialistNetwork:
+        return SpecialistNetwork(self.size)
 
     def _look(self, params: NesamParams, terrain: TerrainMap, state: VehicleState) -> Perception:
         return self.perceive(params, self.exteroception.query(terrain, state))

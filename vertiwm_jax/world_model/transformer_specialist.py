@@ -3,13 +3,12 @@
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.networks.encoder import LATENT_CHANNELS
-from vertiwm_jax.networks.transformer import KeyValueCache, Transformer
+from vertiwm_jax.networks.transformer import KeyValueCache
 from vertiwm_jax.state import Command, Patches, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -17,9 +16,7 @@ from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.normalisation import LOCAL, Normalisation
 from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception
 from vertiwm_jax.world_model.sizes import BASE, TransformerSize
-
-WINDOW = 16
-"""Tokens that F_T remembers, of 0.1 s each."""
+from vertiwm_jax.world_model.specialist_network import SpecialistNetwork
 
 
 @struct.dataclass
@@ -37,44 +34,6 @@ class TransformerHistory:
 
     cache: KeyValueCache
     perception: Perception | None
-
-
-class _Network(nn.Module):
-    """Normalised states and commands, and what is known of the ground, to transitions."""
-
-    size: TransformerSize
-
-    def setup(self) -> None:
-        size = self.size
-        self.embed = nn.Dense(size.width)
-        self.reduce = nn.Dense(size.channels)
-        self.embed_ground = nn.Dense(size.width, use_bias=False)
-        self.transformer = Transformer(size.layers, size.width, size.heads, size.hidden, WINDOW)
-        # The first guess is the mean transition, which is close to constant velocity.
-        self.head = nn.Dense(12, kernel_init=nn.initializers.zeros)
-
-    def __call__(self, motion: jax.Array, ground: jax.Array | None) -> jax.Array:
-        """`[..., T, 10]` and the ground `[..., T, ...]` to `[..., T, 12]`, normalised."""
-        return self.head(self.transformer(self._tokens(motion, ground)))
-
-    def step(
-        self, motion: jax.Array, ground: jax.Array | None, cache: KeyValueCache
-    ) -> tuple[jax.Array, KeyValueCache]:
-        """`[..., 10]` and the ground `[..., ...]` to `[..., 12]`, the last of `__call__`."""
-        token, cache = self.transformer.step(self._tokens(motion, ground), cache)
-        return self.head(token), cache
-
-    def empty_cache(self) -> KeyValueCache:
-        return self.transformer.empty_cache()
-
-    def _tokens(self, motion: jax.Array, ground: jax.Array | None) -> jax.Array:
-        """ground: a latent `[..., 16, 16, 36]`, an indicator `[..., 1]`, or nothing."""
-        tokens = self.embed(motion)
-        if ground is None:
-            return tokens
-        if ground.shape[-1] == 2 * LATENT_CHANNELS:
-            ground = self.reduce(ground).reshape(*tokens.shape[:-1], -1)
-        return tokens + self.embed_ground(ground)
 
 
 @dataclass(frozen=True)
@@ -108,7 +67,7 @@ class TransformerSpecialist:
         self, params: TransformerParams, terrain: TerrainMap, state: VehicleState
     ) -> TransformerHistory:
         """An empty cache and a look at the ground."""
-        empty = self._network.apply(params.network, method=_Network.empty_cache)
+        empty = self._network.apply(params.network, method=SpecialistNetwork.empty_cache)
         perception = self._look(params, terrain, state)
         return TransformerHistory(cast(KeyValueCache, empty), perception)
 
@@ -136,7 +95,9 @@ class TransformerSpecialist:
         inputs = self._inputs(params, terrain, state, command, history.perception)
         output, cache = cast(
             tuple[jax.Array, KeyValueCache],
-            self._network.apply(params.network, *inputs, history.cache, method=_Network.step),
+            self._network.apply(
+                params.network, *inputs, history.cache, method=SpecialistNetwork.step
+            ),
         )
         proposed = motion.advance(state, params.normalisation.transition(output))
         return proposed, replace(history, cache=cache)
@@ -163,8 +124,8 @@ class TransformerSpecialist:
         return motion.advance(states, params.normalisation.transition(output))
 
     @property
-    def _network(self) -> _Network:
-        return _Network(self.size)
+    def _network(self) -> SpecialistNetwork:
+        return SpecialistNetwork(self.size)
 
     def _look(
         self, params: TransformerParams, terrain: TerrainMap, state: VehicleState

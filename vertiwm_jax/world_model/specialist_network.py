@@ -1,0 +1,49 @@
+"""The network of both specialists: tokens of past steps through a cached causal Transformer."""
+
+import flax.linen as nn
+import jax
+
+from vertiwm_jax.networks.encoder import LATENT_CHANNELS
+from vertiwm_jax.networks.transformer import KeyValueCache, Transformer
+from vertiwm_jax.world_model.sizes import TransformerSize
+
+WINDOW = 16
+"""Tokens that a specialist remembers, of 0.1 s each."""
+
+
+class SpecialistNetwork(nn.Module):
+    """Features of past steps, and what is known of the ground, to twelve numbers a step."""
+
+    size: TransformerSize
+
+    def setup(self) -> None:
+        size = self.size
+        self.embed = nn.Dense(size.width)
+        self.reduce = nn.Dense(size.channels)
+        self.embed_ground = nn.Dense(size.width, use_bias=False)
+        self.transformer = Transformer(size.layers, size.width, size.heads, size.hidden, WINDOW)
+        # Untrained, it changes nothing: the mean transition stays, or physics.
+        self.head = nn.Dense(12, kernel_init=nn.initializers.zeros)
+
+    def __call__(self, features: jax.Array, ground: jax.Array | None) -> jax.Array:
+        """`[..., T, F]` and the ground `[..., T, ...]` to `[..., T, 12]`."""
+        return self.head(self.transformer(self._tokens(features, ground)))
+
+    def step(
+        self, features: jax.Array, ground: jax.Array | None, cache: KeyValueCache
+    ) -> tuple[jax.Array, KeyValueCache]:
+        """`[..., F]` and the ground `[..., ...]` to `[..., 12]`, the last of `__call__`."""
+        token, cache = self.transformer.step(self._tokens(features, ground), cache)
+        return self.head(token), cache
+
+    def empty_cache(self) -> KeyValueCache:
+        return self.transformer.empty_cache()
+
+    def _tokens(self, features: jax.Array, ground: jax.Array | None) -> jax.Array:
+        """ground: a latent `[..., 16, 16, 36]`, an indicator `[..., 1]`, or nothing."""
+        tokens = self.embed(features)
+        if ground is None:
+            return tokens
+        if ground.shape[-1] == 2 * LATENT_CHANNELS:
+            ground = self.reduce(ground).reshape(*tokens.shape[:-1], -1)
+        return tokens + self.embed_ground(ground)
