@@ -53,9 +53,9 @@ def main() -> None:
     config = door.TrainConfig()
     params = environment.EnvParams(max_steps_in_episode=600)
     results = {"algorithm alone": iteration(PPO(IdleEnv(), config.ppo), params)}
-    env, params, _ = task.environments(config)
-    ppo = door.algorithm(config, env)
-    results["built-in simulator"] = iteration(ppo, params, config.action_repeat)
+    training, _ = task.environments(config)
+    ppo = door.algorithm(config, training.env)
+    results["built-in simulator"] = iteration(ppo, training.params, config.action_repeat)
     report("ppo_throughput", results, arguments.json)
 
 

@@ -1,5 +1,6 @@
 """The commands from end to end, on settings so small that compiling is all their cost."""
 
+import csv
 import json
 import os
 import shutil
@@ -76,8 +77,7 @@ def numbers(run):
 
 def learned(run):
     config = configuration.load(TrainConfig, run / "config.yaml")
-    env, params = task.test_environment(config, task.held_out(config))
-    return ppo.learned(config, env, params, run)
+    return ppo.learned(config, task.held_out(config), run)
 
 
 def test_a_run_leaves_all_that_was_promised(run, folder):
@@ -215,19 +215,23 @@ def test_policies_that_are_none_are_named(run, tmp_path):
 
 def test_predictions_of_drives(tmp_path, capsys):
     drives(tmp_path, count=25, steps=24, speed=4.0)
+    out = tmp_path / "tables"
     argv = ["prediction", "--data", str(tmp_path), "--context", "2", "--horizon", "4"]
-    evaluate.main([*argv, "--json", str(tmp_path / "found.json")])
-    found = json.loads((tmp_path / "found.json").read_text())
-    assert list(found) == ["builtin", "kinematic bicycle", "constant velocity"]
-    # Three drives of the test split, two windows each, straight on at constant speed.
-    assert all(row["count"] == {"rigid": 6} for row in found.values())
-    assert found["constant velocity"]["mean"]["rigid"] < 1e-4
-    assert found["builtin"]["mean"]["rigid"] < 0.1
+    evaluate.main([*argv, "--models", "builtin", "--output", str(out)])
     assert "| constant velocity | 0.000 (0.000-0.000) | 0 |" in capsys.readouterr().out
+    with (out / "prediction.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["measure"] == "position"]
+    assert [row["model"] for row in rows] == ["builtin", "kinematic bicycle", "constant velocity"]
+    # Three drives of the test split, two windows each, straight on at constant speed.
+    assert all((row["ground"], row["windows"]) == ("rigid", "6") for row in rows)
+    assert float(rows[0]["mean"]) < 0.1 and float(rows[2]["mean"]) < 1e-4
+    text = (out / "prediction.md").read_text()
+    assert "4-step yaw error, deg" in text and "ground under the vehicle" in text
+    assert (out / "prediction.png").stat().st_size > 10_000
 
 
 def test_bad_drives_are_named(tmp_path, capsys):
-    predict = ("prediction", "--data", tmp_path)
+    predict = ("prediction", "--models", "builtin", "--data", tmp_path)
     assert "found none" in refusal(evaluate.main, *predict)
     drives(tmp_path, count=25, steps=24, speed=4.0)
     assert "at least 32 steps, found at most 24" in refusal(evaluate.main, *predict)

@@ -15,7 +15,17 @@ import sys
 import types
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 import tyro
@@ -164,7 +174,8 @@ def _convert(value: Any, kind: Any, field: str) -> Any:
     return value
 
 
-def _convert_dataclass(value: Any, cls: Any, field: str) -> Any:
+def _convert_dataclass(value: Any, cls: Any, field: str, base: Any = None) -> Any:
+    """base: an instance whose values stand where the mapping has none; else those of the class."""
     if not isinstance(value, dict):
         raise _mismatch(value, cls, field)
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
@@ -174,13 +185,19 @@ def _convert_dataclass(value: Any, cls: Any, field: str) -> Any:
             raise _MismatchError(f"{_join(field, key)}: unknown key, expected {expected}")
     for name, f in fields.items():
         no_default = f.default is f.default_factory is dataclasses.MISSING
-        if no_default and name not in value:
+        if base is None and no_default and name not in value:
             expected = _describe(get_type_hints(cls)[name])
             raise _MismatchError(f"{_join(field, name)}: missing, expected {expected}")
     kinds = get_type_hints(cls)
-    converted = {k: _convert(v, kinds[k], _join(field, k)) for k, v in value.items()}
+    converted = {}
+    for key, item in value.items():
+        kind, inner = kinds[key], getattr(base, key, fields[key].default)
+        if dataclasses.is_dataclass(kind) and isinstance(inner, cast(type, kind)):
+            converted[key] = _convert_dataclass(item, kind, _join(field, key), inner)
+        else:
+            converted[key] = _convert(item, kind, _join(field, key))
     try:
-        return cls(**converted)
+        return dataclasses.replace(base, **converted) if base else cls(**converted)
     except ValueError as error:
         prefix = f"{field}: " if field else ""
         raise _MismatchError(f"{prefix}{error}") from error

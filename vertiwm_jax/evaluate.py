@@ -1,32 +1,33 @@
 """`python -m vertiwm_jax.evaluate`: how well a model predicts, and how well a policy drives."""
 
-import dataclasses
+import csv
+import io
 import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, cast
 
 import tyro
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import ppo, runs
 from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.config import ConfigError
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.evaluation import prediction, report
+from vertiwm_jax.evaluation import error_sources, plots, prediction, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
+from vertiwm_jax.evaluation.prediction import MEASURES, PredictionErrors, TestWindows
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.learning.windows import cut
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
-from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.ppo import TrainConfig
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.runs import RunError
+from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.worlds import Difficulty
-
-Model = Literal["builtin"]
+from vertiwm_jax.world_model.choice import ModelName, choose
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,10 @@ class Prediction:
 
     data: Path
     """Folder of `.npz` files of drives, with the maps they name."""
-    model: Model = "builtin"
-    """The model."""
+    models: tuple[ModelName, ...] = ("builtin",)
+    """The models."""
+    weights: Path | None = None
+    """Folder of a fitted model, instead of the one that comes with the package."""
     split: dataset.Split = "test"
     """Which of the drives."""
     context: int = 16
@@ -45,10 +48,12 @@ class Prediction:
     """Steps that it predicts."""
     stride: int = 16
     """Steps from one window to the next."""
-    json: Path | None = None
-    """File to write the numbers to."""
+    output: Path | None = None
+    """Folder for tables and pictures."""
 
     def __post_init__(self):
+        if not self.models:
+            raise ValueError("models: expected at least one, found none")
         for name, least in (("context", 0), ("horizon", 1), ("stride", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: expected at least {least}, found {getattr(self, name)}")
@@ -87,53 +92,75 @@ def main(argv: Sequence[str] | None = None) -> None:
         config=(tyro.conf.FlagConversionOff,),
     )
     try:
-        numbers = _predict(command) if isinstance(command, Prediction) else _navigate(command)
-        if command.json:
-            runs.write_atomic(command.json, json.dumps(numbers, indent=2) + "\n")
-    except (RunError, CheckpointError) as error:
+        _predict(command) if isinstance(command, Prediction) else _navigate(command)
+    except (RunError, CheckpointError, ConfigError, OSError) as error:
         sys.exit(f"error: {error}")
 
 
-def _model(name: Model) -> tuple[Dynamics, Params]:
-    match name:
-        case "builtin":
-            return Simulator(), chrono_like(hmmwv())
-
-
-def _predict(command: Prediction) -> dict[str, Any]:
+def _predict(command: Prediction) -> None:
     try:
         drives, terrain = dataset.load(command.data, command.split)
-        windows = cut(drives, terrain, command.context, command.horizon, command.stride)
+        lengths = command.context, command.horizon, command.stride
+        test = TestWindows.of(drives, terrain, *lengths)
     except ValueError as error:  # what is wrong with the drives, or with their maps
         sys.exit(f"error: {error}")
     models: dict[str, tuple[Dynamics, Params]] = {
-        command.model: _model(command.model),
+        **{name: choose(name, command.weights) for name in command.models},
         "kinematic bicycle": (KinematicBicycle(), bicycle_of(hmmwv())),
         "constant velocity": (ConstantVelocity(), None),
     }
-    rows = [prediction.evaluate(name, *models[name], terrain, windows) for name in models]
-    print(prediction.format_table(rows, command.horizon))
-    return {row.name: dataclasses.asdict(row) for row in rows}
+    rows = [prediction.evaluate(name, *models[name], test) for name in models]
+    print(f"\n{prediction.format_table(rows, 'position', command.horizon)}", flush=True)
+    if command.output:
+        _write_tables(command, rows, test, *models[command.models[0]])
 
 
-def _navigate(command: Navigation) -> dict[str, Any]:
+def _write_tables(
+    command: Prediction,
+    rows: list[PredictionErrors],
+    test: TestWindows,
+    best: Dynamics,
+    params: Params,
+) -> None:
+    """All measures as Markdown and CSV, error over time, and where the first model's error is."""
+    folder = cast(Path, command.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    tables = [prediction.format_table(rows, name, command.horizon) for name in MEASURES]
+    errors, _ = prediction.absolute_errors(best, params, test)
+    shares = error_sources.locate(test, errors["position"][:, -1])
+    tables.append(f"Position error of {rows[0].name}, where it is\n")
+    tables.append(error_sources.format_shares(shares))
+    runs.write_atomic(folder / "prediction.md", "\n\n".join(tables) + "\n")
+    lines = prediction.csv_lines(rows)
+    table = io.StringIO()
+    writer = csv.DictWriter(table, list(lines[0]))
+    writer.writeheader()
+    writer.writerows(lines)
+    runs.write_atomic(folder / "prediction.csv", table.getvalue())
+    figure = plots.error_growth({row.name: row.growth for row in rows}, STEP_SECONDS)
+    plots.save(figure, folder / "prediction.png")
+
+
+def _navigate(command: Navigation) -> None:
     run = command.policy if isinstance(command.policy, Path) else None
     file = run / "config.yaml" if run else configuration.default_config("ppo")
     try:
         config = _adapted(configuration.load(TrainConfig, file), command)
         grounds, maps = config.ground, command.worlds
         terrain = ground.load(grounds, maps) if maps else task.held_out(config)
-        env, test = task.test_environment(config, terrain)
+        test = task.test_environment(config, terrain)
     except ValueError as error:  # what is wrong with configuration, maps, or tasks on them
         sys.exit(f"error: {error}")
     policies = baselines(config.navigation)
     if run:
-        policies = ppo.learned(config, env, test, run) | policies
+        policies = ppo.learned(config, terrain, run) | policies
     elif command.policy == "straight":
         policies = {REFERENCE: policies[REFERENCE]}
-    groups = report.drive(env, test, policies, config.key("testing"))
+    groups = report.drive(test.env, test.params, policies, config.key("testing"))
     print(f"\n{report.markdown(groups, REFERENCE)}")
-    return report.summary(groups, REFERENCE)
+    if command.json:
+        numbers = json.dumps(report.summary(groups, REFERENCE), indent=2)
+        runs.write_atomic(command.json, numbers + "\n")
 
 
 def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:

@@ -21,13 +21,14 @@ from vertiwm_jax.evaluation import plots, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
 from vertiwm_jax.evaluation.navigation import Policy
 from vertiwm_jax.evaluation.report import Results, drive
-from vertiwm_jax.rl import task
+from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.learned import Corrected
 from vertiwm_jax.rl.loop import LoopConfig, restore, train
 from vertiwm_jax.rl.ppo import PPO, PPOConfig, TrainState
 from vertiwm_jax.rl.task import TaskConfig
 from vertiwm_jax.runs import Run, RunError
 from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.training import TrainingError, TrainingInterrupted
 
 Rows = dict[str, Policy]
@@ -44,7 +45,7 @@ CURVES = {
 
 @dataclass(frozen=True)
 class TrainConfig(TaskConfig):
-    """Train an off-road driving policy by PPO inside the built-in simulator."""
+    """Train an off-road driving policy by PPO inside a model of the vehicle."""
 
     runs: Path = Path("runs")
     """Folder in which the folder of this run is made."""
@@ -78,9 +79,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     print(f"all of it is in {run_folder}")
 
 
-def learned(config: TrainConfig, env: NavigationEnv, params: NavigationParams, run: Path) -> Rows:
-    """The policies of the run in the folder `run`, one a seed; `CheckpointError` if none."""
-    ppo = algorithm(config, env)
+def learned(config: TrainConfig, terrain: TerrainMap, run: Path) -> Rows:
+    """The policies of the run in the folder `run`, one a seed; `CheckpointError` if none.
+
+    terrain: any worlds that tests can be drawn on.
+    """
+    tasks = ground.test_tasks(config.ground, terrain)
+    made = task.environment(config, config.model, terrain, tasks)
+    ppo, params = algorithm(config, made.env), made.params
     restored = restore(ppo, params, run, config.loop.seeds)
     if restored is None:
         raise CheckpointError(f"{run}: expected checkpoints of a training, found none")
@@ -118,18 +124,21 @@ def _train_and_report(config: TrainConfig) -> Path:
     if config.compile_cache:
         jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
     try:
-        env, params, test = task.environments(config)
+        training, test = task.environments(config)
     except ValueError as error:  # what is wrong with the maps, or with the tasks on them
         sys.exit(f"error: {error}")
+    env, params = training.env, training.params
     ppo, seeds, iterations = algorithm(config, env), config.loop.seeds, config.ppo.iterations
     steps = config.ppo.batch * config.action_repeat
     restored = restore(ppo, params, config.resume, seeds) if config.resume else None
     with _open(config, restored[0] if restored else 0) as run:
-        print(f"run folder {run.folder}; training on {params.terrain.worlds} worlds", flush=True)
+        print(f"run folder {run.folder}", flush=True)
+        print(f"training in {config.model} on {params.terrain.worlds} worlds", flush=True)
         key = config.key("training")
         state = train(ppo, params, key, run, iterations, steps, config.loop, restored)
         policies = _policies(config, ppo, params, state) | baselines(config.navigation)
-        _report(run, config, test, drive(env, test, policies, config.key("testing")))
+        driven = drive(test.env, test.params, policies, config.key("testing"))
+        _report(run, config, test.params, driven)
     return run.folder
 
 

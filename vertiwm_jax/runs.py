@@ -46,10 +46,7 @@ class Run:
         """
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         try:
-            folder = _make_folder(Path(root), f"{name}-{stamp}")
-            config.save(settings, folder / "config.yaml")
-            (folder / METRICS).touch()
-            return cls(folder, _events_writer(folder))
+            return cls._begin(_make_folder(Path(root), f"{name}-{stamp}"), settings)
         except OSError as error:
             raise RunError(f"{root}: cannot start a run there: {error}") from error
 
@@ -72,6 +69,23 @@ class Run:
         except OSError as error:
             raise RunError(f"{folder}: cannot continue the run: {error}") from error
         return cls(folder, events)
+
+    def part(self, name: str, step: int, settings: Any) -> Self:
+        """A run in the folder `name` inside this one: made, or continued like `open` does."""
+        folder = self.folder / name
+        if (folder / METRICS).is_file():
+            return self.open(folder, step, settings)
+        try:
+            folder.mkdir(exist_ok=True)
+            return self._begin(folder, settings)
+        except OSError as error:
+            raise RunError(f"{folder}: cannot start a run there: {error}") from error
+
+    @classmethod
+    def _begin(cls, folder: Path, settings: Any) -> Self:
+        config.save(settings, folder / "config.yaml")
+        (folder / METRICS).touch()
+        return cls(folder, _events_writer(folder))
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
         """Record scalars at `step` in `metrics.jsonl` and for TensorBoard.

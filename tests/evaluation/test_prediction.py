@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vertiwm_jax.evaluation import prediction
+from vertiwm_jax.evaluation import error_sources, prediction
+from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.windows import Windows, cut
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
@@ -29,6 +30,15 @@ def straight(windows: int = 5) -> Windows:
     control = jnp.zeros((windows, steps, 2)).at[..., 0].set(speed)
     world, ground = jnp.zeros(windows, jnp.int32), jnp.zeros(windows, jnp.int32)
     return Windows(state, control, world, ground, CONTEXT)
+
+
+def errors_of(model, params, windows, drive=None):
+    drive = np.arange(len(windows.world)) if drive is None else drive
+    return prediction.evaluate("it", model, params, TestWindows(windows, drive, GROUND))
+
+
+def means(errors, measure="position"):
+    return {kind: interval.mean for kind, interval in errors.final[measure].items()}
 
 
 @dataclass(frozen=True)
@@ -68,59 +78,106 @@ def test_a_perfect_model_has_no_error():
     windows = windows.replace(state=state)
     predicted = prediction.predict(Recording(), state[0], GROUND, windows)
     np.testing.assert_array_equal(predicted.vector[0], state[0, CONTEXT + 1 :])
-    errors = prediction.evaluate("it", Recording(), state[0], GROUND, windows)
-    assert errors.mean == {"rigid": 0.0}
+    errors = errors_of(Recording(), state[0], windows)
+    assert all(means(errors, measure) == {"rigid": 0.0} for measure in errors.final)
     assert errors.diverged == 0
 
 
 def test_the_error_is_the_distance_in_space_after_the_last_step():
     windows = straight(1)
-    errors = prediction.evaluate("it", Recording(0.5), windows.state[0], GROUND, windows)
-    assert errors.mean["rigid"] == pytest.approx(0.5 * np.sqrt(3), rel=1e-5)
+    errors = errors_of(Recording(0.5), windows.state[0], windows)
+    assert means(errors)["rigid"] == pytest.approx(0.5 * np.sqrt(3), rel=1e-5)
+    assert means(errors, "horizontal")["rigid"] == pytest.approx(0.5 * np.sqrt(2), rel=1e-5)
+    assert means(errors, "height")["rigid"] == pytest.approx(0.5, rel=1e-5)
+    np.testing.assert_allclose(errors.growth["rigid"], [0.5 * np.sqrt(3)] * HORIZON, rtol=1e-5)
+
+
+def test_angles_are_compared_around_the_circle():
+    windows = straight(1)
+    turned = windows.state.at[..., 3:6].set(jnp.array([0.1, -0.2, 3.1]))
+    recorded = windows.replace(state=turned.at[:, CONTEXT + 1 :, 5].set(-3.1))
+    errors = errors_of(Recording(), turned[0], recorded)
+    assert means(errors, "yaw")["rigid"] == pytest.approx(np.degrees(2 * np.pi - 6.2), rel=1e-4)
+    assert means(errors, "roll")["rigid"] == pytest.approx(0.0, abs=1e-5)
 
 
 def test_constant_velocity_is_right_on_straight_drives():
-    errors = prediction.evaluate("it", ConstantVelocity(), None, GROUND, straight())
-    assert errors.mean["rigid"] < 1e-5
+    errors = errors_of(ConstantVelocity(), None, straight())
+    assert means(errors)["rigid"] < 1e-5
     assert errors.count == {"rigid": 5}
 
 
 def test_a_lost_model_counts_as_one_that_did_not_move():
-    errors = prediction.evaluate("it", Faulty(), jnp.float32(3.5), GROUND, straight())
+    errors = errors_of(Faulty(), jnp.float32(3.5), straight())
     assert errors.diverged == 2
     driven = 0.1 * HORIZON * np.array([0, 0, 0, 4, 5])
-    assert errors.mean["rigid"] == pytest.approx(driven.mean(), rel=1e-4)
-    assert errors.low["rigid"] < errors.mean["rigid"] < errors.high["rigid"]
+    found = errors.final["position"]["rigid"]
+    assert found.mean == pytest.approx(driven.mean(), rel=1e-4)
+    assert found.low < found.mean < found.high
 
 
-def test_interval_covers_the_mean_as_often_as_it_says():
+def test_interval_covers_the_mean_as_often_as_it_says_though_drives_differ():
     rng = np.random.default_rng(0)
-    bounds = np.array([prediction._bootstrap(rng.exponential(size=100)) for _ in range(300)])
-    covered = ((bounds[:, 0] < 1) & (bounds[:, 1] > 1)).mean()
-    assert 0.89 < covered < 0.99
+    drive = np.repeat(np.arange(60), 4)
+    covered, naive = [], []
+    for _ in range(300):
+        values = rng.exponential(size=60)[drive] * rng.uniform(0.8, 1.2, drive.size)
+        for groups, hits in ((drive, covered), (np.arange(drive.size), naive)):
+            found = prediction._bootstrap(values, groups)
+            hits.append(found.low < 1 < found.high)
+    assert 0.89 < np.mean(covered) < 0.99
+    assert np.mean(naive) < 0.8
 
 
 def test_kinds_of_ground_are_apart():
     windows = straight(4).replace(ground=jnp.array([0, 2, 2, 0]))
-    errors = prediction.evaluate("it", Faulty(), jnp.float32(0.0), GROUND, windows)
+    errors = errors_of(Faulty(), jnp.float32(0.0), windows)
     assert errors.count == {"rigid": 2, "transition": 2}
-    assert errors.mean["rigid"] == pytest.approx(0.6 * 2.5, rel=1e-4)
-    assert errors.mean["transition"] == pytest.approx(0.6 * 2.5, rel=1e-4)
+    assert means(errors)["rigid"] == pytest.approx(0.6 * 2.5, rel=1e-4)
+    assert means(errors)["transition"] == pytest.approx(0.6 * 2.5, rel=1e-4)
 
 
-def test_table():
-    windows = straight()
+def test_tables():
     rows = [
-        prediction.evaluate("still", Faulty(), jnp.float32(0.0), GROUND, windows),
-        prediction.evaluate("constant velocity", ConstantVelocity(), None, GROUND, windows),
+        replace(errors_of(Faulty(), jnp.float32(0.0), straight()), name="still"),
+        replace(errors_of(ConstantVelocity(), None, straight()), name="constant velocity"),
     ]
-    lines = prediction.format_table(rows, HORIZON).splitlines()
+    lines = prediction.format_table(rows, "position", HORIZON).splitlines()
     assert lines[0].startswith("6-step position error, m")
     assert lines[2] == "| model | rigid (n = 5) | diverged |"
     assert lines[3] == "|---|---|---|"
     assert lines[4].startswith("| still | 1.800 (")
     assert lines[4].endswith(" | 5 |")
     assert lines[5] == "| constant velocity | 0.000 (0.000-0.000) | 0 |"
+    table = prediction.csv_lines(rows)
+    assert len(table) == 2 * len(prediction.MEASURES)
+    assert table[0]["model"] == "still" and table[0]["mean"] == pytest.approx(1.8, rel=1e-4)
+
+
+def test_error_is_found_where_it_is():
+    semantic = np.full((16, 16), 3)
+    semantic[:, 8:] = terrain_map.STANDARD.names.index("mud")  # east of x = 0
+    terrain = terrain_map.build(np.zeros((65, 65)), semantic)
+    windows = straight(4)
+    x = jnp.array([-20.0, -3.0, 0.5, 20.0])
+    windows = windows.replace(state=windows.state.at[..., 0].add(x[:, None]))
+    chassis = jnp.zeros((4, CONTEXT + HORIZON + 1, 3)).at[3, -1, 2].set(100.0)
+    windows = windows.replace(auxiliary=windows.auxiliary.replace(chassis_force=chassis))
+    start = np.asarray(windows.state[:, CONTEXT, 0])
+    shares = error_sources.locate(
+        TestWindows(windows, np.arange(4), terrain), np.array([1.0, 2.0, 3.0, 4.0])
+    )
+    found = {(x.quantity, x.value): x for x in shares}
+    mud = found["ground under the vehicle", "mud"]
+    assert mud.windows == np.mean(start > 0) and mud.error == pytest.approx(0.7)
+    assert found["belly", "on the ground"].mean == 4.0
+    assert found["border of soil, m away", "from 8"].windows == 0.5
+    assert found["speed at the start, m/s", "0.5 to 1.5"].mean == 1.0
+    for quantity in {x.quantity for x in shares}:
+        parts = [x for x in shares if x.quantity == quantity]
+        assert sum(x.windows for x in parts) == pytest.approx(1)
+        assert sum(x.error for x in parts) == pytest.approx(1)
+    assert error_sources.format_shares(shares).count("\n") == len(shares) + 1
 
 
 def test_the_built_in_simulator_beats_both_baselines_on_chrono_drives():

@@ -124,10 +124,10 @@ def test_updates_are_those_of_adamw_by_hand():
         for name, g in gradient.items():
             g = np.float64(g) * min(1, 1 / norm)
             first, second = moments[name]
-            first, second = 0.9 * first + 0.1 * g, 0.999 * second + 0.001 * g**2
+            first, second = 0.9 * first + 0.1 * g, 0.99 * second + 0.01 * g**2
             moments[name] = [first, second]
             direction = first / (1 - 0.9 ** (step + 1))
-            direction /= np.sqrt(second / (1 - 0.999 ** (step + 1))) + 1e-8
+            direction /= np.sqrt(second / (1 - 0.99 ** (step + 1))) + 1e-8
             weights[name] -= float(rate(step)) * (direction + 1e-4 * weights[name])
     chex.assert_trees_all_close(state.trained, jax.tree.map(np.float32, weights), atol=1e-5)
 

@@ -15,9 +15,9 @@ from vertiwm_jax.terrain.soil import PRESETS, stack
 WHEEL = Wheel(0.467, 0.254)
 SOILS = stack([PRESETS[name] for name in ("mud", "sand", "snow")])
 MUD, SAND, SNOW = 0, 1, 2
-SHARP = ScmContact(resistance=0.75, creep_speed=1e-5)
+SHARP = ScmContact(creep_speed=1e-5)
 """Shear as in Chrono: at full strength at any slip."""
-SMOOTH = ScmContact(resistance=0.75, creep_speed=0.4)
+SMOOTH = ScmContact(creep_speed=0.4)
 run = jax.jit(scm_forces, static_argnames="nodes")
 
 CASES = [  # soil, sinkage m, hub m/s, lateral m/s, rim m/s, rut m
@@ -78,7 +78,8 @@ def reference(soil, contact, sinkage, hub, lateral, rim, rut, columns=1000):
         sigma += float(contact.damping) * np.maximum(downwards, 0.0)
         tau = cohesion + sigma * np.tan(phi)
         tau *= (1 - np.exp(-sheared[touched] / modulus)) / speed
-        moment = tau * backwards * arm + float(contact.resistance) * sigma * ahead
+        fresh = hub / np.hypot(hub, float(contact.fresh_speed))
+        moment = tau * backwards * arm + fresh * sigma * ahead
         stresses = tau * backwards, -tau * lateral, sigma, moment
     return spacing * b * np.array([s.sum() for s in stresses])
 
@@ -146,6 +147,17 @@ def test_a_wheel_without_torque_is_braked_most_by_the_softest_soil():
         assert abs(f.torque[free]) < 10 and omega[free] < 2.0 / WHEEL.radius
         drag.append(-f.longitudinal[free])
     assert 0 < drag[0] < drag[1] < drag[2]
+
+
+def test_compaction_resists_travel_and_not_spin_in_place():
+    contacts = (SMOOTH, replace(SMOOTH, fresh_speed=1e9), replace(SMOOTH, fresh_speed=0.0))
+    for speed, like in ((0.0, 1), (20.0, 2)):
+        torque, other = (
+            run(WHEEL, SOILS, contacts[i], 0.05, speed, 0.0, 60.0).torque for i in (0, like)
+        )
+        np.testing.assert_allclose(torque, other, rtol=2e-3)
+    slow = [run(WHEEL, SOILS, contact, 0.05, 1.0, 0.0, 60.0).torque for contact in contacts]
+    assert np.all(slow[1] < slow[0]) and np.all(slow[0] < slow[2])
 
 
 def sunk(soil, contact, load, *motion):

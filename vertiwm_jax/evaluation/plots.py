@@ -107,6 +107,28 @@ def learning_curves(
     return figure
 
 
+def error_growth(
+    growth: Mapping[str, Mapping[str, Sequence[float]]], step_seconds: float
+) -> Figure:
+    """Position error over the time predicted, a panel for each kind of ground.
+
+    growth: by model and then by kind, m after each step.
+    """
+    kinds = list(next(iter(growth.values())))
+    with _style():
+        figure = _figure(3.2 * len(kinds), 2.8)
+        panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
+        for axes, kind in zip(panels, kinds, strict=True):
+            for i, (name, by_kind) in enumerate(growth.items()):
+                colour, dash = _line(i)
+                seconds = step_seconds * (1 + np.arange(len(by_kind[kind])))
+                axes.plot(seconds, by_kind[kind], dash, label=name, color=colour)
+            axes.set(title=kind, xlabel="time [s]", xlim=(0, None), ylim=(0, None))
+        panels[0].set_ylabel("position error [m]")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    return figure
+
+
 def save(figure: Figure, path: str | Path) -> None:
     """Write a figure as a whole or not at all, in the format of the ending; else `RunError`."""
     image = io.BytesIO()

@@ -1,5 +1,6 @@
 """Open-loop prediction error of dynamics models on recorded drives."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -7,11 +8,78 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax import geometry
 from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.learning import windows as recorded
+from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.learning.rollouts import open_loop
 from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
+
+MEASURES = {
+    "position": "m",
+    "horizontal": "m",
+    "height": "m",
+    "roll": "deg",
+    "pitch": "deg",
+    "yaw": "deg",
+}
+"""Absolute errors and their units; position is the distance in space."""
+BATCH = 512
+"""Windows that are predicted at once, which bounds the memory."""
+
+
+@dataclass(frozen=True)
+class TestWindows:
+    """Windows of drives to predict.
+
+    drive: `[N]` index of the drive that each is from. Windows of a drive are much alike, so
+    intervals are drawn over drives.
+    """
+
+    __test__ = False  # the name starts as pytest's classes do
+
+    windows: Windows
+    drive: np.ndarray
+    terrain: TerrainMap
+
+    @classmethod
+    def of(
+        cls, drives: Drives, terrain: TerrainMap, context: int, horizon: int, stride: int
+    ) -> "TestWindows":
+        """All windows of the drives; raises what `windows.index` raises."""
+        index = recorded.index(drives, terrain, context, horizon, stride)
+        return cls(recorded.gather(drives, index), np.asarray(index.drive), terrain)
+
+    def __len__(self) -> int:
+        return len(self.drive)
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean with its 95 % bootstrap interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class PredictionErrors:
+    """Errors of one model.
+
+    final: by measure and then by kind of ground, mean absolute error after the last step.
+    growth: by kind of ground, mean position error after each step, m.
+    count: by kind of ground, windows.
+    diverged: windows whose prediction is not finite; they enter as if the model had not moved.
+    """
+
+    name: str
+    final: dict[str, dict[str, Interval]]
+    growth: dict[str, list[float]]
+    count: dict[str, int]
+    diverged: int
 
 
 @partial(jax.jit, static_argnames="dynamics")
@@ -28,66 +96,87 @@ def predict(
         ground = terrain.select(window.world)
         return open_loop(dynamics, params, ground, window, lambda _: None)[0]
 
-    return jax.vmap(one)(windows)
+    return jax.lax.map(one, windows, batch_size=BATCH)
 
 
-@dataclass(frozen=True)
-class PredictionErrors:
-    """Mean final position error of one model, m, by kind of ground.
-
-    mean, low, high: by ground, the mean and its 95 % bootstrap interval over windows; count: by
-    ground, windows. Windows whose prediction is not finite are counted in `diverged` and enter
-    the mean with the distance driven, as if the model had not moved.
-    """
-
-    name: str
-    mean: dict[str, float]
-    low: dict[str, float]
-    high: dict[str, float]
-    count: dict[str, int]
-    diverged: int
-
-
-def evaluate(
-    name: str, dynamics: Dynamics, params: Params, terrain: TerrainMap, windows: Windows
-) -> PredictionErrors:
-    """Position error after the last step of every window, in 3-D."""
-    final = predict(dynamics, params, terrain, windows).position[:, -1]
-    truth = windows.state[:, -1, :3]
-    error = np.asarray(jnp.linalg.norm(final - truth, axis=-1))
-    still = np.asarray(jnp.linalg.norm(windows.state[:, windows.context, :3] - truth, axis=-1))
-    finite = np.isfinite(error)
-    error, ground = np.where(finite, error, still), np.asarray(windows.ground)
-    groups = {kind: error[ground == i] for i, kind in enumerate(GROUNDS) if (ground == i).any()}
-    bounds = {kind: _bootstrap(values) for kind, values in groups.items()}
-    return PredictionErrors(
-        name=name,
-        mean={kind: float(values.mean()) for kind, values in groups.items()},
-        low={kind: bound[0] for kind, bound in bounds.items()},
-        high={kind: bound[1] for kind, bound in bounds.items()},
-        count={kind: len(values) for kind, values in groups.items()},
-        diverged=int((~finite).sum()),
-    )
+def absolute_errors(
+    dynamics: Dynamics, params: Params, test: TestWindows
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """By measure, `[N, K]` in its unit, and `[N]` bool, whether the prediction diverged."""
+    windows = test.windows
+    predicted = predict(dynamics, params, test.terrain, windows)
+    truth = windows.state[:, windows.context + 1 :, :6]
+    start = windows.state[:, windows.context, None, :6]
+    pose = jnp.concatenate([predicted.position, predicted.rpy], axis=-1)
+    lost = ~jnp.all(jnp.isfinite(pose), axis=(1, 2))
+    difference = jnp.where(lost[:, None, None], start, pose) - truth
+    turn = jnp.degrees(jnp.abs(geometry.wrap(difference[..., 3:])))
+    errors = {
+        "position": jnp.linalg.norm(difference[..., :3], axis=-1),
+        "horizontal": jnp.linalg.norm(difference[..., :2], axis=-1),
+        "height": jnp.abs(difference[..., 2]),
+        "roll": turn[..., 0],
+        "pitch": turn[..., 1],
+        "yaw": turn[..., 2],
+    }
+    return {name: np.asarray(error) for name, error in errors.items()}, np.asarray(lost)
 
 
-def format_table(rows: list[PredictionErrors], horizon: int) -> str:
-    """A Markdown table, one model a row."""
+def evaluate(name: str, dynamics: Dynamics, params: Params, test: TestWindows) -> PredictionErrors:
+    """Errors after the last step of every window, by kind of ground."""
+    errors, lost = absolute_errors(dynamics, params, test)
+    ground = np.asarray(test.windows.ground)
+    rows = {kind: ground == i for i, kind in enumerate(GROUNDS) if (ground == i).any()}
+    final = {
+        measure: {kind: _bootstrap(error[row, -1], test.drive[row]) for kind, row in rows.items()}
+        for measure, error in errors.items()
+    }
+    growth = {kind: errors["position"][row].mean(axis=0).tolist() for kind, row in rows.items()}
+    count = {kind: int(row.sum()) for kind, row in rows.items()}
+    return PredictionErrors(name, final, growth, count, int(lost.sum()))
+
+
+def format_table(rows: Sequence[PredictionErrors], measure: str, horizon: int) -> str:
+    """A Markdown table of one measure, one model a row."""
     kinds = list(rows[0].count)
     counts = [f"{kind} (n = {rows[0].count[kind]})" for kind in kinds]
     lines = [
-        f"{horizon}-step position error, m: mean and 95 % interval",
+        f"{horizon}-step {measure} error, {MEASURES[measure]}: mean and 95 % interval over drives",
         "",
         "| model | " + " | ".join(counts) + " | diverged |",
         "|" + "---|" * (len(kinds) + 2),
     ]
     for row in rows:
-        cells = [f"{row.mean[k]:.3f} ({row.low[k]:.3f}-{row.high[k]:.3f})" for k in kinds]
+        found = [row.final[measure][kind] for kind in kinds]
+        cells = [f"{x.mean:.3f} ({x.low:.3f}-{x.high:.3f})" for x in found]
         lines.append(f"| {row.name} | " + " | ".join(cells) + f" | {row.diverged} |")
     return "\n".join(lines)
 
 
-def _bootstrap(values: np.ndarray, draws: int = 1000) -> tuple[float, float]:
-    rng = np.random.default_rng(0)
-    means = values[rng.integers(0, len(values), (draws, len(values)))].mean(axis=1)
+def csv_lines(rows: Sequence[PredictionErrors]) -> list[Mapping[str, str | float]]:
+    """One line for each model, measure and kind of ground."""
+    return [
+        {
+            "model": row.name,
+            "measure": measure,
+            "unit": MEASURES[measure],
+            "ground": kind,
+            "windows": row.count[kind],
+            "mean": x.mean,
+            "low": x.low,
+            "high": x.high,
+        }
+        for row in rows
+        for measure, by_kind in row.final.items()
+        for kind, x in by_kind.items()
+    ]
+
+
+def _bootstrap(values: np.ndarray, groups: np.ndarray, draws: int = 1000) -> Interval:
+    """The mean of values `[n]`, and its interval when whole groups `[n]` are drawn again."""
+    names, member = np.unique(groups, return_inverse=True)
+    sums, sizes = np.bincount(member, values), np.bincount(member)
+    drawn = np.random.default_rng(0).integers(0, len(names), (draws, len(names)))
+    means = sums[drawn].sum(axis=1) / sizes[drawn].sum(axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
-    return float(low), float(high)
+    return Interval(float(values.mean()), float(low), float(high))

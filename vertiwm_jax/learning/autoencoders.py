@@ -27,11 +27,11 @@ class AutoencoderConfig:
 
     patches: PatchConfig = PatchConfig("vehicle", "bilinear")
     """How heights become patches; models that use the encoders must use the same."""
-    batch: int = 64
+    batch: int = 16
     """Patches in a batch."""
     offset: float = 20.0
     """How far from a recorded place patches are taken, m, along x and y; their yaw is any."""
-    validation: int = 512
+    validation: int = 256
     """Patches to validate on, at recorded poses."""
 
     def __post_init__(self):
@@ -99,22 +99,15 @@ class AutoencoderProblem:
 
     def loss(self, params: Params, data: PatchData, key: jax.Array) -> jax.Array:
         """The mean squared error `[]` of both, on patches near recorded places."""
-        row_key, offset_key, yaw_key = jax.random.split(key, 3)
-        batch = self.config.batch
-        rows = jax.random.randint(row_key, (batch,), 0, len(data.places.yaw))
-        places = jax.tree.map(lambda x: x[rows], data.places)
-        offset = self.config.offset * jax.random.uniform(offset_key, (batch, 2), minval=-1.0)
-        yaw = jax.random.uniform(yaw_key, (batch,), minval=-jnp.pi, maxval=jnp.pi)
 
-        def one(place: Places, offset: jax.Array, yaw: jax.Array) -> jax.Array:
+        def one(place: Places) -> jax.Array:
             terrain = data.terrain.select(place.world)
-            position = _move(terrain, place.position, offset)
-            patches = query.patches(terrain, position, yaw, self.config.patches)
+            patches = query.patches(terrain, place.position, place.yaw, self.config.patches)
             again = reconstruct(params, patches)
             elevation = jnp.mean((again.elevation - patches.elevation) ** 2)
             return elevation + jnp.mean((again.rgb - patches.rgb) ** 2)
 
-        return jnp.mean(jax.vmap(one)(places, offset, yaw))
+        return jnp.mean(jax.vmap(one)(near(data, key, self.config)))
 
     def validate(self, params: Params, data: PatchData) -> dict[str, jax.Array]:
         """Errors of reconstruction at recorded poses; `error` is the loss there.
@@ -143,6 +136,20 @@ class AutoencoderProblem:
             "colour_accuracy": accuracy,
             "error": elevation + colour,
         }
+
+
+def near(data: PatchData, key: jax.Array, config: AutoencoderConfig) -> Places:
+    """A batch of places near recorded ones, turned anyhow."""
+    row_key, offset_key, yaw_key = jax.random.split(key, 3)
+    rows = jax.random.randint(row_key, (config.batch,), 0, len(data.places.yaw))
+    places = jax.tree.map(lambda x: x[rows], data.places)
+    shape = config.batch, 2
+    offset = config.offset * jax.random.uniform(offset_key, shape, minval=-1.0)
+    position = jax.vmap(lambda world, *args: _move(data.terrain.select(world), *args))(
+        places.world, places.position, offset
+    )
+    yaw = jax.random.uniform(yaw_key, (config.batch,), minval=-jnp.pi, maxval=jnp.pi)
+    return Places(position, yaw, places.world)
 
 
 def encoders(params: Params) -> EncoderParams:

@@ -22,6 +22,8 @@ RESULT = "fitted"
 """Folder in that of the run that holds the parameters a fit ended with."""
 LAST_LEARNING_RATE = 0.01
 """At the end of the schedule, as a share of the highest."""
+SECOND_MOMENT = 0.99
+"""Decay of squared gradients (Adam's beta 2): crashes make some large ones, soon forgotten."""
 LARGEST_SKIPPED = 0.1
 """Share of the updates of an iteration whose gradients may be infinite or NaN."""
 
@@ -56,7 +58,7 @@ class FitConfig:
     """Gradients are clipped to this global norm."""
     trainable: tuple[str, ...] = ()
     """Entries of the parameters that are trained, dotted like "gate.network"; all when empty."""
-    checkpoints: CheckpointConfig = CheckpointConfig()
+    checkpoints: CheckpointConfig = CheckpointConfig(checkpoint_every=5, keep=1)
     """What is kept of the training."""
 
     def __post_init__(self):
@@ -177,7 +179,7 @@ class Fit:
         )
         descent = optax.chain(
             optax.clip_by_global_norm(config.max_gradient_norm),
-            optax.adamw(rate, weight_decay=config.weight_decay),
+            optax.adamw(rate, b2=SECOND_MOMENT, weight_decay=config.weight_decay),
         )
         # Never applied, however many there are in a row: too many end the training.
         return optax.apply_if_finite(descent, max_consecutive_errors=config.updates)

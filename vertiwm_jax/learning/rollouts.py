@@ -199,7 +199,7 @@ def open_loop(
     """The K states predicted in one window, leaves `[K, 3]`, and what is read of the histories.
 
     The history is warmed up on the recorded context; from its last state on, the model sees its
-    own predictions and the recorded commands.
+    own predictions and the recorded commands. No gradient flows into the context.
     """
     c = window.context
     recorded, commands = VehicleState.from_vector(window.state), Command.from_vector(window.control)
@@ -212,6 +212,7 @@ def open_loop(
         state, history = dynamics.step(params, terrain, carry[1], carry[0], command)
         return (state, history), (state, read(history))
 
+    history = jax.lax.stop_gradient(history)
     return jax.lax.scan(advance, (start, history), _at(commands, slice(c, None)))[1]
 
 

@@ -32,13 +32,14 @@ class ScmContact:
     """Coefficients `[...]` beside those of the soil.
 
     damping: Pa s/m by which a rim that moves downwards raises the pressure.
-    resistance: share of the moment of that pressure about the axle, all of it ahead of the hub,
-        that soil springing back behind the hub leaves over.
+    fresh_speed: m/s of travel at which the moment of that pressure about the axle reaches 71 %
+        of what untouched soil ahead of the hub gives: a wheel that stands, spinning or not, lies
+        in its own hole, which presses on both sides alike.
     creep_speed: m/s of slip at which shear reaches 71 % of its strength.
     """
 
     damping: Scalar = 3e4
-    resistance: Scalar = 1.0
+    fresh_speed: Scalar = 1.0
     creep_speed: Scalar = 0.1
 
 
@@ -69,7 +70,7 @@ def scm_forces(
     ahead = jnp.where(both >= 0, 1.0, -1.0)
     hub, rim = ahead * velocity_x, ahead * wheel.radius * omega
     creep = contact.creep_speed
-    rolling = jnp.abs(both) * jax.lax.rsqrt(both**2 + creep**2)
+    fresh = hub * jax.lax.rsqrt(hub**2 + contact.fresh_speed**2)
 
     depth = jnp.clip((sinkage - rut) / wheel.radius, 0.0, MAX_SINKAGE)
     touching = depth > _MIN_SINKAGE
@@ -111,7 +112,7 @@ def scm_forces(
         strength = soil.cohesion + sigma * jnp.tan(soil.friction_angle)
         tau = strength * (1 - jnp.exp(-path / soil.shear_modulus))
         tau = tau * jax.lax.rsqrt(along**2 + across**2 + creep**2)
-        moment = tau * along * cos + contact.resistance * rolling * sigma * sin
+        moment = tau * along * cos + fresh * sigma * sin
         weight = weight * (stop - start) * cos
         stresses = (tau * along, tau * across, sigma, moment)
         return tuple(t + weight * s for t, s in zip(total, stresses, strict=True)), None

@@ -77,7 +77,7 @@ def chrono_like(vehicle: Vehicle) -> SimulatorParams:
     """
     return SimulatorParams(
         vehicle=jax.tree.map(jnp.asarray, vehicle),
-        contact=ScmContact(*map(jnp.float32, (3e4, 0.75, 0.4))),
+        contact=ScmContact(*map(jnp.float32, (3e4, 1.0, 0.4))),
         stiffening=jnp.float32(1.8),
     )
 

@@ -51,6 +51,18 @@ class SoilPredictor(nn.Module):
         return Soil(**fields, unit_weight=jnp.broadcast_to(unit_weight, shares.shape[:-1]))
 
 
+def shares(soil: Soil) -> jax.Array:
+    """`[...]` soils to `[..., 6]` where in `BOUNDS` each parameter lies, from 0 to 1."""
+    columns = []
+    for name, (low, high) in BOUNDS.items():
+        value = jnp.clip(getattr(soil, name), low, high)
+        if name in _LOGARITHMIC:
+            columns.append(jnp.log(value / low) / math.log(high / low))
+        else:
+            columns.append((value - low) / (high - low))
+    return jnp.stack(columns, axis=-1)
+
+
 def _between(share: jax.Array, low: float, high: float, logarithmic: bool) -> jax.Array:
     """Shares `[...]` in [0, 1] to values from low to high, even in the value or its logarithm."""
     if logarithmic:

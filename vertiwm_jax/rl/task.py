@@ -7,12 +7,14 @@ from typing import Literal
 import jax
 
 from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv, NavigationParams
+from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.rl import ground
 from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model.choice import ModelName, choose
 
 
 @dataclass(frozen=True)
@@ -27,8 +29,12 @@ class TaskConfig:
     """What worlds and tasks."""
     navigation: NavigationConfig = NavigationConfig()
     """What the task is."""
+    model: ModelName = "builtin"
+    """What moves the vehicle while learning; in tests it is always the built-in simulator."""
+    weights: Path | None = None
+    """Folder of a fitted model, instead of the one that comes with the package."""
     simulator: Simulator = Simulator()
-    """What moves the vehicle."""
+    """The built-in simulator."""
 
     def key(self, purpose: Literal["worlds", "tasks", "training", "testing"]) -> jax.Array:
         """The random key of one purpose."""
@@ -36,16 +42,24 @@ class TaskConfig:
         return jax.random.fold_in(jax.random.key(self.seed), number)
 
 
-def environments(config: TaskConfig) -> tuple[NavigationEnv, NavigationParams, NavigationParams]:
-    """The environment, its parameters to train with, and those to test with.
+@dataclass(frozen=True)
+class Task:
+    """An environment and its parameters."""
 
-    Maps that cannot be used, and tasks that cannot be driven on them, raise `ValueError`.
+    env: NavigationEnv
+    params: NavigationParams
+
+
+def environments(config: TaskConfig) -> tuple[Task, Task]:
+    """What to train in, and what to test in.
+
+    Maps that cannot be used, and tasks that cannot be driven on them, raise `ValueError`; weights
+    that cannot be read, `CheckpointError`.
     """
     terrain, held_out = ground.grounds(config.ground, config.worlds, config.key("worlds"))
     chassis = config.navigation.chassis
     tasks = ground.training_tasks(config.ground, terrain, chassis, config.key("tasks"))
-    env, test = test_environment(config, held_out)
-    return env, env.make_params(chrono_like(hmmwv()), terrain, tasks), test
+    return environment(config, config.model, terrain, tasks), test_environment(config, held_out)
 
 
 def held_out(config: TaskConfig) -> TerrainMap:
@@ -53,13 +67,18 @@ def held_out(config: TaskConfig) -> TerrainMap:
     return ground.grounds(config.ground, config.worlds, config.key("worlds"))[1]
 
 
-def test_environment(
-    config: TaskConfig, terrain: TerrainMap
-) -> tuple[NavigationEnv, NavigationParams]:
-    """The environment, and its parameters to test with on these worlds."""
-    env = NavigationEnv(config.simulator, config.navigation)
-    tasks = ground.test_tasks(config.ground, terrain)
-    return env, env.make_params(chrono_like(hmmwv()), terrain, tasks)
+def test_environment(config: TaskConfig, terrain: TerrainMap) -> Task:
+    """The test on these worlds, in the built-in simulator."""
+    return environment(config, "builtin", terrain, ground.test_tasks(config.ground, terrain))
+
+
+def environment(config: TaskConfig, model: ModelName, terrain: TerrainMap, tasks: Tasks) -> Task:
+    """Tasks inside one of the models."""
+    dynamics, params = config.simulator, chrono_like(hmmwv())
+    if model != "builtin":
+        dynamics, params = choose(model, config.weights)
+    env = NavigationEnv(dynamics, config.navigation)
+    return Task(env, env.make_params(params, terrain, tasks))
 
 
 def outcomes(info: dict[str, jax.Array]) -> dict[str, jax.Array]:

@@ -1,20 +1,34 @@
 """Verti-WM: two specialists and the recurrent gate that fuses them, a `Dynamics` itself."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, cast
+from pathlib import Path
+from typing import Any, Literal, Self, cast
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from vertiwm_jax import checkpoints
+from vertiwm_jax import config as configuration
 from vertiwm_jax.dynamics import History, Params
+from vertiwm_jax.mechanics.simulator import SimulatorParams, chrono_like
+from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.networks.gate import HIDDEN, Gate
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import fusion
 from vertiwm_jax.world_model.fusion import CONTEXT_SIZE, POSITION_AND_YAW, GateTerrain, Proposal
+from vertiwm_jax.world_model.nesam import Nesam
+from vertiwm_jax.world_model.normalisation import Normalisation
 from vertiwm_jax.world_model.perception import Perception, Specialist
+from vertiwm_jax.world_model.sizes import BASE, PAPER
+from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
 
+PRETRAINED = Path(__file__).parents[1] / "weights"
+"""Folder of the model that comes with the package; its model card is `docs/model_card.md`."""
+_CONFIG = "model.yaml"
+_CONSTANT = 1e-6
+_SIZES = {"base": BASE, "paper": PAPER}
 _GATE = Gate()
 
 
@@ -61,6 +75,50 @@ class VertiWMHistory:
 
 
 @dataclass(frozen=True)
+class ModelConfig:
+    """Which model: what `VertiWM` is made of, in a form that a file can hold."""
+
+    size: Literal["base", "paper"] = "base"
+    """Of both specialists' networks."""
+    reads_patches: bool = False
+    """Whether NeSAM's correction sees encoded patches beside what physics makes of the ground."""
+    soil: Literal["map", "predicted"] = "map"
+    """Whether NeSAM uses the soils of the map or predicts them from what the ground looks like."""
+    gate_terrain: GateTerrain = "mean"
+    """What the gate reads of the ground."""
+    coefficients: Literal["grouped", "scalar"] = "grouped"
+    """Fusion coefficients for four groups of motion, or one for all."""
+
+    @property
+    def transformer(self) -> TransformerSpecialist:
+        """The specialist for rigid ground."""
+        return TransformerSpecialist(_SIZES[self.size])
+
+    @property
+    def nesam(self) -> Nesam:
+        """The specialist for soil."""
+        return Nesam(_SIZES[self.size], reads_patches=self.reads_patches, soil=self.soil)
+
+    def build(self) -> "VertiWM":
+        """Both fused."""
+        return VertiWM(self.transformer, self.nesam, self.gate_terrain, self.coefficients)
+
+    def init_params(
+        self,
+        key: jax.Array,
+        simulator: SimulatorParams,
+        normalisation: Normalisation | None = None,
+    ) -> VertiWMParams:
+        """Untrained parameters of all parts."""
+        keys = jax.random.split(key, 3)
+        return self.build().init_params(
+            keys[0],
+            self.transformer.init_params(keys[1], normalisation),
+            self.nesam.init_params(keys[2], simulator, normalisation),
+        )
+
+
+@dataclass(frozen=True)
 class VertiWM:
     """Fuses a learned specialist for rigid ground with a physical one for soil (Sec. IV-C).
 
@@ -84,6 +142,12 @@ class VertiWM:
         network = _GATE.init(key, mean, jnp.zeros(HIDDEN))
         return VertiWMParams(transformer, nesam, GateParams(network, mean, scale))
 
+    @classmethod
+    def pretrained(cls) -> tuple[Self, VertiWMParams]:
+        """The model that comes with the package, for a HMMWV, and its parameters."""
+        model, params = load(PRETRAINED)
+        return cast(Self, model), params
+
     def init(
         self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState
     ) -> VertiWMHistory:
@@ -104,24 +168,49 @@ class VertiWM:
         command: Command,
     ) -> tuple[VehicleState, VertiWMHistory]:
         """Both specialists propose from the fused state, and see the next one."""
+        first, second, following = self._propose(params, terrain, history, state, command)
+        context = fusion.context(state, command, first, second, self.gate_terrain)
+        alpha, hidden = self._weigh(params.gate, context, history.hidden)
+        state = fusion.fuse(state, first, second, alpha)
+        following = replace(following, hidden=hidden, coefficients=alpha)
+        return state, self._seeing(params, terrain, following, state)
+
+    def context_along(
+        self,
+        params: VertiWMParams,
+        terrain: TerrainMap,
+        states: VehicleState,
+        commands: Command,
+    ) -> jax.Array:
+        """`[T, C]` what the gate reads at every recorded state; leaves `[T, 3]`, commands `[T]`."""
+
+        def advance(
+            history: VertiWMHistory, inputs: tuple[VehicleState, Command]
+        ) -> tuple[VertiWMHistory, jax.Array]:
+            state, command = inputs
+            history = self._seeing(params, terrain, history, state)
+            first, second, following = self._propose(params, terrain, history, state, command)
+            return following, fusion.context(state, command, first, second, self.gate_terrain)
+
+        first = jax.tree.map(lambda x: x[0], states)
+        return jax.lax.scan(advance, self.init(params, terrain, first), (states, commands))[1]
+
+    def _propose(
+        self,
+        params: VertiWMParams,
+        terrain: TerrainMap,
+        history: VertiWMHistory,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[Proposal, Proposal, VertiWMHistory]:
+        """What the Transformer and NeSAM would do, and their histories after it."""
         by_transformer, transformer = self.transformer.propose(
             params.transformer, terrain, history.transformer, state, command
         )
         by_nesam, nesam = self.nesam.propose(params.nesam, terrain, history.nesam, state, command)
         first = Proposal.of(state, by_transformer, history.transformer.perception)
         second = Proposal.of(state, by_nesam, history.nesam.perception)
-
-        context = fusion.context(state, command, first, second, self.gate_terrain)
-        alpha, hidden = self._weigh(params.gate, context, history.hidden)
-        state = fusion.fuse(state, first, second, alpha)
-
-        seen_by_transformer, seen_by_nesam = self._look(params, terrain, state)
-        return state, VertiWMHistory(
-            replace(transformer, perception=seen_by_transformer),
-            replace(nesam, perception=seen_by_nesam),
-            hidden,
-            alpha,
-        )
+        return first, second, replace(history, transformer=transformer, nesam=nesam)
 
     def _weigh(
         self, gate: GateParams, context: jax.Array, hidden: jax.Array
@@ -136,12 +225,67 @@ class VertiWM:
             outputs = jnp.broadcast_to(jnp.mean(outputs), outputs.shape)
         return fusion.coefficients(outputs), hidden
 
-    def _look(
-        self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState
-    ) -> tuple[Perception, Perception]:
-        """What both see at a state: through encoders of their own, of the same patches if any."""
+    def _seeing(
+        self,
+        params: VertiWMParams,
+        terrain: TerrainMap,
+        history: VertiWMHistory,
+        state: VehicleState,
+    ) -> VertiWMHistory:
+        """The history with what both see at a state, each through encoders of its own."""
         patches = self.transformer.exteroception.query(terrain, state)
-        seen_by_transformer = self.transformer.perceive(params.transformer, patches)
+        by_transformer = self.transformer.perceive(params.transformer, patches)
         if self.nesam.exteroception.patches != self.transformer.exteroception.patches:
             patches = self.nesam.exteroception.query(terrain, state)
-        return seen_by_transformer, self.nesam.perceive(params.nesam, patches)
+        by_nesam = self.nesam.perceive(params.nesam, patches)
+        return replace(
+            history,
+            transformer=replace(history.transformer, perception=by_transformer),
+            nesam=replace(history.nesam, perception=by_nesam),
+        )
+
+
+def calibrate(
+    model: VertiWM,
+    params: VertiWMParams,
+    terrain: TerrainMap,
+    states: VehicleState,
+    commands: Command,
+) -> VertiWMParams:
+    """The parameters with the constants of the gate's context measured on recorded drives.
+
+    states: leaves `[N, T + 1, 3]` on the worlds `terrain.world` `[N]`; commands: leaves `[N, T]`.
+    """
+
+    def one(world: jax.Array, states: VehicleState, commands: Command) -> jax.Array:
+        before = jax.tree.map(lambda x: x[:-1], states)
+        return model.context_along(params, terrain.select(world), before, commands)
+
+    context = jax.jit(jax.vmap(one))(terrain.world, states, commands)
+    context = context.reshape(-1, context.shape[-1])
+    deviation = jnp.std(context, axis=0)
+    scale = jnp.where(deviation > _CONSTANT, 1 / jnp.maximum(deviation, _CONSTANT), 0.0)
+    scale = scale.at[jnp.array(POSITION_AND_YAW)].set(0.0)
+    gate = replace(params.gate, mean=jnp.mean(context, axis=0), scale=scale)
+    return replace(params, gate=gate)
+
+
+def save(folder: Path, config: ModelConfig, params: VertiWMParams) -> None:
+    """Write a model to `folder`, for `load`; raises what `checkpoints.save` raises."""
+    checkpoints.save(folder, 0, params, keep=1)
+    configuration.save(config, folder / _CONFIG)
+
+
+def load(folder: Path) -> tuple[VertiWM, VertiWMParams]:
+    """The model that `save` wrote to `folder`.
+
+    `ConfigError` or `CheckpointError` when it holds none, or one of another version.
+    """
+    config = configuration.load(ModelConfig, folder / _CONFIG)
+    path = checkpoints.latest(folder)
+    if path is None:
+        raise checkpoints.CheckpointError(f"{folder}: expected the weights of a model, found none")
+    like = jax.eval_shape(
+        lambda key: config.init_params(key, chrono_like(hmmwv())), jax.random.key(0)
+    )
+    return config.build(), checkpoints.load(path, like)

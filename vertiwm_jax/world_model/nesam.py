@@ -9,9 +9,11 @@ from flax import struct
 
 from vertiwm_jax.mechanics.simulator import Simulator, SimulatorHistory, SimulatorParams
 from vertiwm_jax.networks.encoder import LATENT_CHANNELS
+from vertiwm_jax.networks.soil_predictor import SoilPredictor
 from vertiwm_jax.networks.transformer import KeyValueCache
 from vertiwm_jax.state import Command, Patches, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.soil import Soil
 from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.normalisation import LOCAL, Normalisation
 from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception
@@ -24,13 +26,14 @@ LARGEST_INPUT = 8.0
 """Where inputs of the network are cut off, lest a crash blind it for a whole window."""
 TRAVEL, SINKAGE = 0.05, 0.1
 """Typical travel of a wheel, and typical depth of a track in soil, m."""
+_SOIL = SoilPredictor()
 NUDGE = 0.05
 """Change of velocities, m/s and rad/s, by which `calibrate` measures how physics answers."""
 
 
 @struct.dataclass
 class NesamParams:
-    """network: what is learned; encoders: frozen by default.
+    """network: what is learned; encoders: frozen by default; soil: weights of the `SoilPredictor`.
 
     correction_scale: `[12]` root mean square of what physics misses in a step (`difference`).
     response: `[12, 6]` change of a proposed `motion.transition` per change of the velocities that
@@ -40,6 +43,7 @@ class NesamParams:
 
     network: Any
     encoders: EncoderParams
+    soil: Any
     simulator: SimulatorParams
     normalisation: Normalisation
     correction_scale: jax.Array
@@ -73,6 +77,8 @@ class Nesam:
     gradient: "exact" through the simulator; or "mean", several times cheaper, as if what it
         proposes depended on the velocities alone, and on them linearly (`NesamParams.response`).
         Values are the same.
+    soil: whose parameters physics uses: those that the "map" has for each class of ground, or
+        those "predicted" from what the ground at the vehicle looks like, the same for all wheels.
     exteroception: how it looks at patches.
     """
 
@@ -80,6 +86,7 @@ class Nesam:
     residual: bool = True
     reads_patches: bool = False
     gradient: Literal["exact", "mean"] = "mean"
+    soil: Literal["map", "predicted"] = "map"
     exteroception: Exteroception = Exteroception()
     simulator: Simulator = Simulator()
 
@@ -90,11 +97,13 @@ class Nesam:
         normalisation: Normalisation | None = None,
     ) -> NesamParams:
         """Physics as it is, and a network that leaves it so; see `calibrate` before learning."""
-        encoder_key, network_key = jax.random.split(key)
+        encoder_key, network_key, soil_key = jax.random.split(key, 3)
+        latent = jnp.zeros((16, 16, LATENT_CHANNELS))
         ground = jnp.zeros((1, 16, 16, 2 * LATENT_CHANNELS)) if self.reads_patches else None
         return NesamParams(
             network=self._network.init(network_key, jnp.zeros((1, FEATURES)), ground),
             encoders=self.exteroception.init_params(encoder_key),
+            soil=_SOIL.init(soil_key, latent, jnp.float32(0)),
             simulator=simulator,
             normalisation=normalisation or Normalisation.unit(),
             correction_scale=jnp.ones(12),
@@ -129,16 +138,17 @@ class Nesam:
         command: Command,
     ) -> tuple[VehicleState, NesamHistory]:
         """`step` up to the next state; `history.perception` is still that of `state`."""
-        physics, memory = self._physics(params, terrain, history.simulator, state, command)
+        ground = self._ground(params, terrain, history.perception)
+        physics, memory = self._physics(params, ground, history.simulator, state, command)
         following = replace(history, simulator=memory, physics=physics)
         if not self.residual:
             return physics, following
         features = _features(params, history.physics, state, command, physics, memory)
-        ground = history.perception.latent if self.reads_patches else None
+        seen = history.perception.latent if self.reads_patches else None
         output, cache = cast(
             tuple[jax.Array, KeyValueCache],
             self._network.apply(
-                params.network, features, ground, history.cache, method=SpecialistNetwork.step
+                params.network, features, seen, history.cache, method=SpecialistNetwork.step
             ),
         )
         correction = _fixed(params.correction_scale) * output
@@ -183,7 +193,8 @@ class Nesam:
         """
 
         def advance(memory: SimulatorHistory, inputs: tuple[VehicleState, Command]):
-            proposed, memory = self.simulator.step(params.simulator, terrain, memory, *inputs)
+            ground = self._ground(params, terrain, self._look(params, terrain, inputs[0]))
+            proposed, memory = self.simulator.step(params.simulator, ground, memory, *inputs)
             return memory, (proposed, memory)
 
         first = jax.tree.map(lambda x: x[0], states)
@@ -196,6 +207,19 @@ class Nesam:
 
     def _look(self, params: NesamParams, terrain: TerrainMap, state: VehicleState) -> Perception:
         return self.perceive(params, self.exteroception.query(terrain, state))
+
+    def _ground(
+        self, params: NesamParams, terrain: TerrainMap, perception: Perception
+    ) -> TerrainMap:
+        """The map with the soils that physics is to use."""
+        if self.soil == "map":
+            return terrain
+        predicted = cast(Soil, _SOIL.apply(params.soil, perception.semantic, jnp.float32(0)))
+        everywhere = jax.tree.map(
+            lambda x: jnp.broadcast_to(x, terrain.deformable.shape), predicted
+        )
+        soils = replace(everywhere, unit_weight=terrain.soils.unit_weight)
+        return replace(terrain, soils=soils)
 
     def _physics(
         self,

@@ -1,0 +1,138 @@
+"""`python -m vertiwm_jax.fit` from end to end, on settings so small that compiling is its cost."""
+
+import shutil
+from pathlib import Path
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vertiwm_jax import fit, runs
+from vertiwm_jax.dynamics import rollout
+from vertiwm_jax.learning import dataset
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.world_model import model
+from vertiwm_jax.world_model.choice import choose
+
+RECORDED = Path(__file__).parent / "data" / "chrono_drives"
+STAGES = (
+    "nesam_autoencoders", "nesam_soil", "nesam_single_steps", "nesam_rollouts",
+    "nesam_refinement",
+    "transformer_autoencoders", "transformer_single_steps", "transformer_rollouts", "gate",
+)  # fmt: skip
+SHORT = "{updates: 2, updates_per_iteration: 1, warm_up: 0}"
+TINY = f"""
+windows: {{batch: 2, context: 2, horizon: 3, validation: 2}}
+patches: {{batch: 2, validation: 2}}
+transformer: {{autoencoders: {SHORT}, single_steps: {SHORT}, rollouts: {SHORT}}}
+nesam:
+  {{autoencoders: {SHORT}, single_steps: {SHORT}, rollouts: {SHORT},
+   refinement: {{updates: 2, updates_per_iteration: 1, warm_up: 0, trainable: [network]}}}}
+soil: {SHORT}
+gate: {{learns_from: [deformable], rollouts: {SHORT}}}
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two collections of 25 drives, which are few drives several times over."""
+    folder = tmp_path_factory.mktemp("fit")
+    (folder / "tiny.yaml").write_text(TINY)
+    for kind in ("rigid", "deformable"):
+        (folder / "drives" / kind).mkdir(parents=True)
+        with np.load(RECORDED / f"{kind}_001.npz", allow_pickle=False) as file:
+            arrays = dict(file)
+        count = len(arrays["length"])
+        rows = np.arange(25) % count
+        np.savez(
+            folder / "drives" / kind / "world.npz",
+            **{name: x[rows] if len(x.shape) else x for name, x in arrays.items()},
+        )
+    shutil.copytree(RECORDED / "maps", folder / "drives" / "maps")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fitted(folder):
+    """Runs the door; gives the newest run folder."""
+
+    def fitted(*argv):
+        cache = ["--compile-cache", str(folder / "compiled")]
+        first = ["--config", str(folder / "tiny.yaml"), "--data", str(folder / "drives")]
+        first += ["--runs", str(folder / "runs")]
+        fit.main([*([] if "--resume" in argv else first), *cache, *argv])
+        return max((folder / "runs").iterdir(), key=lambda run: run.stat().st_ctime_ns)
+
+    yield fitted
+    jax.config.update("jax_compilation_cache_dir", None)
+
+
+@pytest.fixture(scope="module")
+def run(fitted):
+    return fitted()
+
+
+def refusal(*argv):
+    with pytest.raises(SystemExit) as stop:
+        fit.main([str(word) for word in argv])
+    message = stop.value.code
+    assert isinstance(message, str) and message.startswith("error: ") and "\n" not in message
+    return message
+
+
+def test_every_stage_leaves_its_metrics_and_all_together_a_model(run, folder):
+    for stage in STAGES:
+        lines = runs.read_metrics(run / stage)
+        assert [line["updates"] for line in lines] == [1, 2], stage
+        assert all(np.isfinite(line["error"]) for line in lines), stage
+    drives, terrain = dataset.load(folder / "drives" / "deformable", "test")
+    state = VehicleState.from_vector(jnp.asarray(drives.state[0, 0]))
+    commands = Command.from_vector(jnp.asarray(drives.control[0, :3]))
+    ground = terrain.select(jnp.int32(0))
+    ends = {}
+    for name in ("transformer", "nesam", "vertiwm", "builtin"):
+        dynamics, params = choose(name, run / "model")
+        history = dynamics.init(params, ground, state)
+        states = rollout(dynamics, params, ground, history, state, commands)
+        ends[name] = np.asarray(states.position[-1])
+        assert np.linalg.norm(ends[name] - drives.state[0, 3, :3]) < 0.3, name
+    assert len({tuple(end) for end in ends.values()}) == 4
+
+
+def test_constants_are_measured_and_only_what_is_named_is_learned(run):
+    untrained = model.ModelConfig().init_params(jax.random.key(0), choose("builtin")[1])
+    params = model.load(run / "model")[1]
+    assert np.all(np.asarray(params.nesam.correction_scale) != 1)
+    scale = np.asarray(params.gate.scale)
+    assert np.all(scale[list(model.POSITION_AND_YAW)] == 0) and (scale > 0).sum() > 50
+    chex.assert_trees_all_equal(params.nesam.simulator, untrained.nesam.simulator)
+    for specialist in (params.transformer, params.nesam):
+        deviation = np.asarray(specialist.normalisation.transition_deviation)
+        assert np.all(deviation != 1)
+
+
+def test_stages_that_have_ended_are_not_repeated(run, fitted, capsys):
+    before = model.load(run / "model")[1]
+    times = {stage: (run / stage / "fitted").stat().st_mtime_ns for stage in STAGES}
+    shutil.rmtree(run / "gate")
+    shutil.rmtree(run / "model")
+    capsys.readouterr()
+    assert fitted("--resume", str(run)) == run
+    printed = capsys.readouterr().out
+    assert "gate" in printed and "single_steps" not in printed
+    chex.assert_trees_all_equal(model.load(run / "model")[1], before)
+    for stage in STAGES[:-1]:
+        assert (run / stage / "fitted").stat().st_mtime_ns == times[stage], stage
+
+
+def test_what_cannot_be_fitted_is_named(run, folder, tmp_path):
+    message = refusal("--data", tmp_path, "--runs", tmp_path / "runs")
+    assert "expected files of drives, or folders of them named rigid" in message
+    again = shutil.copytree(run, tmp_path / "again")
+    message = refusal("--resume", again, "--model.gate-terrain", "both")
+    assert "gate" in message and "belongs to another configuration" in message
+    with pytest.raises(model.checkpoints.CheckpointError, match="weights of a model"):
+        shutil.rmtree(again / "model" / "0")
+        model.load(again / "model")

@@ -1,0 +1,71 @@
+"""`python -m vertiwm_jax.fit`: fit Verti-WM to recorded drives, all stages of it."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+
+from vertiwm_jax import config as configuration
+from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.learning import pipeline
+from vertiwm_jax.learning.pipeline import PipelineConfig
+from vertiwm_jax.runs import Run, RunError
+from vertiwm_jax.training import TrainingError, TrainingInterrupted
+from vertiwm_jax.world_model import model
+
+
+@dataclass(frozen=True)
+class FitConfig(PipelineConfig):
+    """Fit Verti-WM to recorded drives: autoencoders, both specialists, the gate."""
+
+    data: tuple[Path, ...] = (Path("data/open"),)
+    """Folders of drives, or of such folders named rigid, deformable and mixed."""
+    seed: int = 0
+    """Decides everything that is random."""
+    runs: Path = Path("runs")
+    """Folder in which the folder of this run is made."""
+    resume: Path | None = None
+    """Folder of an earlier run to go on with; stages that have ended are not repeated."""
+    compile_cache: Path | None = None
+    """Folder that keeps compiled programs for later runs."""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; expected failures end in one line and a status that is not 0."""
+    config = _configuration(argv)
+    if config.compile_cache:
+        jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
+    try:
+        settings = replace(config, resume=None)
+        with _open(config.resume, config.runs, settings) as run:
+            print(f"run folder {run.folder}", flush=True)
+            _, params = pipeline.fit(config, config.data, jax.random.key(config.seed), run)
+            model.save(run.folder / "model", config.model, params)
+    except TrainingInterrupted as stopped:
+        print(stopped)
+        sys.exit(130)
+    except KeyboardInterrupt:
+        print("stopped at once; go on from the newest checkpoint with --resume and the run folder")
+        sys.exit(130)
+    except (RunError, CheckpointError, TrainingError, ValueError) as error:
+        sys.exit(f"error: {error}")
+    print(f"the model is in {run.folder / 'model'}")
+
+
+def _configuration(argv: Sequence[str] | None) -> FitConfig:
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--resume", type=Path)
+    resume = first.parse_known_args(argv)[0].resume
+    file = resume / "config.yaml" if resume else configuration.default_config("fit_chrono")
+    return configuration.parse(FitConfig, file, argv, "python -m vertiwm_jax.fit")
+
+
+def _open(resume: Path | None, runs: Path, settings: FitConfig) -> Run:
+    return Run.open(resume, 0, settings) if resume else Run.create(runs, "fit", settings)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,215 @@
+"""The whole of Verti-WM from recorded drives: what is fitted, in which order, to which drives.
+
+Every stage is a `fitting.fit` in a folder of its own inside that of the run. One that has ended is
+not repeated, and one that was stopped goes on from its newest checkpoint.
+"""
+
+import operator
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+from vertiwm_jax import checkpoints
+from vertiwm_jax.dynamics import Params
+from vertiwm_jax.learning import autoencoders, dataset, fitting, normalisation, windows
+from vertiwm_jax.learning.autoencoders import AutoencoderConfig, AutoencoderProblem, PatchData
+from vertiwm_jax.learning.dataset import Auxiliary, Drives, Split
+from vertiwm_jax.learning.fitting import FitConfig, Problem
+from vertiwm_jax.learning.losses import LossConfig
+from vertiwm_jax.learning.rollouts import OneStep, OpenLoop, WindowConfig, WindowData, WindowProblem
+from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.learning.soils import SoilProblem
+from vertiwm_jax.mechanics.simulator import chrono_like
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.runs import Run
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model import model, nesam
+from vertiwm_jax.world_model.model import ModelConfig, VertiWM, VertiWMParams
+from vertiwm_jax.world_model.nesam import Nesam
+from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
+
+Kind = Literal["rigid", "deformable", "mixed"]
+KINDS: tuple[Kind, ...] = ("rigid", "deformable", "mixed")
+"""Collections of drives, by the ground of their worlds; also the names of their folders."""
+SAMPLE = 512
+"""Windows on which the constants of a model are measured before it learns."""
+
+
+@dataclass(frozen=True)
+class SpecialistConfig:
+    """How one specialist is fitted."""
+
+    learns_from: tuple[Kind, ...] = KINDS
+    """Collections for it and for its encoders."""
+    autoencoders: FitConfig = FitConfig(updates=1000, weight_decay=0.0)
+    """Of terrain patches; the encoders are frozen afterwards."""
+    single_steps: FitConfig = FitConfig(updates=400, warm_up=50, trainable=("network",))
+    """From recorded states, all of a window at once: a cheap beginning."""
+    rollouts: FitConfig = FitConfig(updates=10_000, trainable=("network",))
+    """Open loop, as it will be used."""
+    refinement: FitConfig | None = None
+    """More of the same, with a schedule of its own (a warm restart)."""
+
+
+@dataclass(frozen=True)
+class GateConfig:
+    """How the gate is fitted, to both specialists as they are."""
+
+    learns_from: tuple[Kind, ...] = ("mixed",)
+    """Collections for it."""
+    rollouts: FitConfig = FitConfig(updates=600, warm_up=50, trainable=("gate.network",))
+    """Open loop; `trainable` may name parts of `transformer` and `nesam` too."""
+
+
+@dataclass(frozen=True)
+class PipelineConfig:
+    """What world model is fitted, and how."""
+
+    model: ModelConfig = ModelConfig()
+    """What is fitted."""
+    windows: WindowConfig = WindowConfig(weights=(1.0, 1.0, 2.0))
+    """Which windows of the drives."""
+    loss: LossConfig = LossConfig(velocity=0.05)
+    """Of predictions."""
+    patches: AutoencoderConfig = AutoencoderConfig()
+    """Which patches of the ground, for autoencoders and soil predictor."""
+    transformer: SpecialistConfig = SpecialistConfig()
+    """The specialist for rigid ground."""
+    nesam: SpecialistConfig = SpecialistConfig()
+    """The specialist for soil."""
+    soil: FitConfig = FitConfig(updates=2000, weight_decay=0.0, trainable=("soil",))
+    """The soil predictor."""
+    gate: GateConfig = GateConfig()
+    """What fuses the two."""
+
+
+def fit(
+    config: PipelineConfig, folders: Sequence[Path], key: jax.Array, run: Run
+) -> tuple[VertiWM, VertiWMParams]:
+    """All stages in turn; folders hold drives, or folders of drives named like `KINDS`.
+
+    Raises what `dataset.load`, `WindowData.of` and `fitting.fit` raise.
+    """
+    stages = _Stages(config, tuple(folders), key, run)
+    verti_wm = config.model.build()
+    constants = normalisation.measure(stages.load(KINDS, "train")[0])
+    params = config.model.init_params(key, chrono_like(hmmwv()), constants)
+    second = stages.specialist("nesam", config.model.nesam, params.nesam, config.nesam)
+    first = stages.specialist(
+        "transformer", config.model.transformer, params.transformer, config.transformer
+    )
+    params = replace(params, transformer=first, nesam=second)
+    return verti_wm, stages.gate(verti_wm, params)
+
+
+@dataclass(frozen=True)
+class _Stages:
+    """What the stages of one pipeline share."""
+
+    config: PipelineConfig
+    folders: tuple[Path, ...]
+    key: jax.Array
+    run: Run
+
+    def specialist(
+        self,
+        name: str,
+        specialist: TransformerSpecialist | Nesam,
+        params: Any,
+        config: SpecialistConfig,
+    ) -> Any:
+        """Its encoders, then for NeSAM what soils look like, then how it moves."""
+        drives = self._drives(config.learns_from)
+        patches = replace(self.config.patches, patches=specialist.exteroception.patches)
+        places = cache(lambda: PatchData.of(patches, *drives()))
+        problem = AutoencoderProblem(patches)
+        pair = problem.init_params(self._key(name))
+        pair = self._fit(f"{name}_autoencoders", problem, config.autoencoders, pair, places)
+        params = replace(params, encoders=autoencoders.encoders(pair))
+        if isinstance(specialist, Nesam):
+            looks = {"encoders": params.encoders, "soil": params.soil}
+            problem = SoilProblem(patches)
+            looks = self._fit(f"{name}_soil", problem, self.config.soil, looks, places)
+            params = replace(params, soil=looks["soil"])
+            params = nesam.calibrate(specialist, params, *self._sample(drives))
+
+        data = cache(lambda: WindowData.of(self.config.windows, *drives()))
+        deviation = tuple(params.normalisation.transition_deviation.tolist())
+        single, rollouts = OneStep(specialist, deviation), OpenLoop(specialist, self.config.loss)
+        for part, objective, schedule in (
+            ("single_steps", single, config.single_steps),
+            ("rollouts", rollouts, config.rollouts),
+            ("refinement", rollouts, config.refinement),
+        ):
+            if schedule:
+                problem = WindowProblem(specialist, objective, self.config.windows)
+                params = self._fit(f"{name}_{part}", problem, schedule, params, data)
+        return params
+
+    def gate(self, verti_wm: VertiWM, params: VertiWMParams) -> VertiWMParams:
+        """The gate between two specialists."""
+        config = self.config.gate
+        drives = self._drives(config.learns_from)
+        params = model.calibrate(verti_wm, params, *self._sample(drives))
+        objective = OpenLoop(verti_wm, self.config.loss, operator.attrgetter("coefficients"))
+        problem = WindowProblem(verti_wm, objective, self.config.windows)
+        data = cache(lambda: WindowData.of(self.config.windows, *drives()))
+        return self._fit("gate", problem, config.rollouts, params, data)
+
+    def _fit(
+        self,
+        name: str,
+        problem: Problem,
+        config: FitConfig,
+        params: Params,
+        data: Callable[[], Any],
+    ) -> Any:
+        """The fitted parameters of a stage, from its folder if it has ended before."""
+        folder = self.run.folder / name
+        done = fitting.load(folder, params)
+        if done is not None:
+            return done
+        print(f"\n{name}", flush=True)
+        checkpoint = checkpoints.latest(folder / "checkpoints")
+        with self.run.part(name, int(checkpoint.name) if checkpoint else 0, config) as part:
+            return fitting.fit(problem, config, params, data(), self._key(name), part)
+
+    def _key(self, name: str) -> jax.Array:
+        return jax.random.fold_in(self.key, zlib.crc32(name.encode()))
+
+    def _drives(
+        self, kinds: Sequence[Kind]
+    ) -> Callable[[], tuple[tuple[Drives, TerrainMap], tuple[Drives, TerrainMap]]]:
+        """Reads drives to learn from and to validate on, once."""
+        return cache(lambda: (self.load(kinds, "train"), self.load(kinds, "validation")))
+
+    def load(self, kinds: Sequence[Kind], split: Split) -> tuple[Drives, TerrainMap]:
+        """Drives of these kinds in all folders, and of folders that are not divided into kinds."""
+        chosen: list[Path] = []
+        for folder in self.folders:
+            chosen += [folder] if any(folder.glob("*.npz")) else []
+            chosen += [folder / kind for kind in kinds if (folder / kind).is_dir()]
+        if not chosen:
+            raise DataError(
+                f"{', '.join(map(str, self.folders))}: expected files of drives, or folders of "
+                f"them named {' or '.join(kinds)}, found neither"
+            )
+        drives, terrain = dataset.load(chosen, split)
+        return replace(drives, auxiliary=Auxiliary()), terrain
+
+    def _sample(self, drives: Callable) -> tuple[TerrainMap, VehicleState, Command]:
+        """Some windows of the training drives as a measurement takes them, each on its world."""
+        recorded, terrain = drives()[0]
+        config = self.config.windows
+        index = windows.index(recorded, terrain, config.context, config.horizon, config.stride)
+        rows = np.linspace(0, len(index.drive) - 1, SAMPLE).astype(int)
+        some = windows.gather(recorded, jax.tree.map(lambda x: x[rows], index))
+        states = VehicleState.from_vector(some.state)
+        return terrain.select(some.world), states, Command.from_vector(some.control)

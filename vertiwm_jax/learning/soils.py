@@ -1,0 +1,61 @@
+"""Learning what soils look like: the soil predictor on the semantic latents of recorded places."""
+
+from dataclasses import dataclass
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+
+from vertiwm_jax.dynamics import Params
+from vertiwm_jax.learning.autoencoders import AutoencoderConfig, PatchData, Places, near
+from vertiwm_jax.networks import soil_predictor
+from vertiwm_jax.networks.soil_predictor import BOUNDS, SoilPredictor
+from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.soil import Soil
+from vertiwm_jax.world_model.perception import EncoderParams, Exteroception
+
+_NETWORK = SoilPredictor()
+
+
+@dataclass(frozen=True)
+class SoilProblem:
+    """A `fitting.Problem`: the soil under the vehicle, from what the ground around it looks like.
+
+    The map's own soils supervise; places on rigid ground teach nothing. Parameters are `encoders`,
+    frozen, and `soil`.
+    """
+
+    config: AutoencoderConfig
+
+    def loss(self, params: Params, data: PatchData, key: jax.Array) -> jax.Array:
+        """Mean squared error `[]` of the six parameters, each as its share of `BOUNDS`."""
+        places = near(data, key, self.config)
+        error, counts = jax.vmap(lambda place: self._error(params, data.terrain, place))(places)
+        return jnp.sum(jnp.mean(error**2, axis=-1)) / jnp.maximum(jnp.sum(counts), 1.0)
+
+    def validate(self, params: Params, data: PatchData) -> dict[str, jax.Array]:
+        """Root mean square errors at recorded places on soil, as shares of `BOUNDS`."""
+        error, counts = jax.lax.map(
+            lambda place: self._error(params, data.validation_terrain, place),
+            data.validation,
+            batch_size=self.config.batch,
+        )
+        square = jnp.sum(error**2, axis=0) / jnp.maximum(jnp.sum(counts), 1.0)
+        each = {f"error_{name}": jnp.sqrt(x) for name, x in zip(BOUNDS, square, strict=True)}
+        return {**each, "error": jnp.sqrt(jnp.mean(square))}
+
+    def _error(
+        self, params: Params, terrain: TerrainMap, place: Places
+    ) -> tuple[jax.Array, jax.Array]:
+        """`[6]` differences at one place, zero on rigid ground, and 1 on soil."""
+        world = terrain.select(place.world)
+        exteroception = Exteroception(self.config.patches)
+        patches = query.patches(world, place.position, place.yaw, self.config.patches)
+        encoders = cast(EncoderParams, params["encoders"])
+        latent = exteroception.encode(encoders, patches).semantic
+        predicted = cast(Soil, _NETWORK.apply(params["soil"], latent, jnp.float32(0)))
+        kind = query.surface(world, place.position[:2]).semantic
+        true = jax.tree.map(lambda x: x[kind], world.soils)
+        soft = terrain.deformable[kind].astype(jnp.float32)
+        return soft * (soil_predictor.shares(predicted) - soil_predictor.shares(true)), soft
