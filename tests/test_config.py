@@ -38,6 +38,13 @@ class Task:
     optimizer: Optimizer = field(default_factory=Optimizer)
 
 
+@dataclass(frozen=True)
+class Careful:
+    """Learns slowly unless told otherwise."""
+
+    task: Task = Task("careful", optimizer=Optimizer(1e-5, clip=0.5))
+
+
 def write(tmp_path: Path, text: str) -> Path:
     path = tmp_path / "task.yaml"
     path.write_text(text)
@@ -95,6 +102,15 @@ def test_bad_files_are_refused_in_one_clear_line(tmp_path, text, words):
     assert message.startswith(f"{path}: ")
     for word in words:
         assert word in message
+
+
+def test_a_mapping_changes_what_it_names_and_leaves_the_rest_of_a_default(tmp_path):
+    path = write(tmp_path, "task: {seed: 1, optimizer: {anneal: off}}")
+    expected = Task("careful", 1, optimizer=Optimizer(1e-5, clip=0.5, anneal=False))
+    assert config.load(Careful, path) == Careful(expected)
+    path = write(tmp_path, "task: {optimizer: {learning_rate: -1}}")
+    with pytest.raises(ConfigError, match=r"task.optimizer: learning_rate must be positive"):
+        config.load(Careful, path)
 
 
 def test_missing_and_unreadable_files(tmp_path):

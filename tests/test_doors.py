@@ -18,6 +18,9 @@ from vertiwm_jax.rl import task
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.world_model import model
+from vertiwm_jax.world_model.choice import choose
+from vertiwm_jax.world_model.model import ModelConfig
 
 GRASS = 3
 TINY = """
@@ -196,6 +199,19 @@ def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch
     assert "random" not in text and "Solved of" not in text
     evaluate.main([*navigate, "random"])
     assert "| random" in capsys.readouterr().out
+
+
+def test_training_inside_a_world_model_and_judged_in_the_simulator(train, tmp_path, capsys):
+    config = ModelConfig()
+    params = config.init_params(jax.random.key(0), choose("builtin")[1])
+    model.save(tmp_path / "model", config, params)
+    run = train("--model", "vertiwm", "--weights", str(tmp_path / "model"))
+    assert "training in vertiwm on 2 worlds" in capsys.readouterr().out
+    assert all(np.isfinite(line["policy_loss"]) for line in runs.read_metrics(run))
+    evaluate.main(["navigation", "--policy", str(run)])
+    assert (run / "summary.md").read_text() in capsys.readouterr().out
+    message = refusal(ppo.main, "--model", "nesam", "--weights", tmp_path, "--runs", tmp_path)
+    assert "model.yaml: no such file" in message
 
 
 def test_policies_that_are_none_are_named(run, tmp_path):

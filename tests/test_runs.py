@@ -78,6 +78,19 @@ def test_resuming_drops_what_followed_the_checkpoint(tmp_path):
     assert (3, "return", 30.0) in scalars(run.folder)
 
 
+def test_a_part_is_a_run_inside_a_run_and_goes_on_like_one(tmp_path):
+    with Run.create(tmp_path, "whole", Settings()) as run:
+        with run.part("first", 0, Settings(1)) as part:
+            assert part.folder == run.folder / "first" and part.outermost == run.folder
+            part.log(1, {"loss": 1.0})
+            part.log(2, {"loss": 0.5})
+        with run.part("first", 1, Settings(2)) as part:
+            part.log(2, {"loss": 0.4})
+        assert [line["loss"] for line in runs.read_metrics(part.folder)] == [1.0, 0.4]
+        assert config.load(Settings, part.folder / "config.yaml") == Settings(2)
+        assert runs.read_metrics(run.folder) == []
+
+
 def test_a_torn_last_line_is_dropped(tmp_path):
     with Run.create(tmp_path, "ppo", Settings()) as run:
         run.log(1, {"return": 1.0})

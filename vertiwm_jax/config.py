@@ -58,7 +58,8 @@ def default_config(name: str) -> Path:
 def load(cls: type[T], path: str | Path) -> T:
     """Read the YAML file at `path` into the dataclass `cls`.
 
-    Keys that the file leaves out take the dataclass's defaults. A missing file, an unknown,
+    Keys that the file leaves out take the dataclass's defaults; within a nested dataclass, those of
+    the default instance. A missing file, an unknown,
     repeated, missing or ill-typed key, or a value that the dataclass refuses raises
     `ConfigError`.
     """
@@ -126,6 +127,18 @@ def parse(
         description=inspect.getdoc(cls),
         config=(tyro.conf.AvoidSubcommands, tyro.conf.FlagConversionOff),
     ).fields
+
+
+def parse_resumable(cls: type[T], name: str, argv: Sequence[str] | None, program: str) -> T:
+    """`parse` with the file `name` that comes with the package, or that of the run to `--resume`.
+
+    cls: has a field `resume`, the folder of a run, or None.
+    """
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--resume", type=Path)
+    resume = first.parse_known_args(argv)[0].resume
+    file = resume / "config.yaml" if resume else default_config(name)
+    return parse(cls, file, argv, program)
 
 
 class _MismatchError(Exception):

@@ -36,7 +36,7 @@ class Prediction:
 
     data: Path
     """Folder of `.npz` files of drives, with the maps they name."""
-    models: tuple[ModelName, ...] = ("builtin",)
+    models: tuple[ModelName, ...] = ("vertiwm", "nesam", "transformer", "builtin")
     """The models."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""

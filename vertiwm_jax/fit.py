@@ -1,6 +1,5 @@
 """`python -m vertiwm_jax.fit`: fit Verti-WM to recorded drives, all stages of it."""
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -56,11 +55,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _configuration(argv: Sequence[str] | None) -> FitConfig:
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--resume", type=Path)
-    resume = first.parse_known_args(argv)[0].resume
-    file = resume / "config.yaml" if resume else configuration.default_config("fit_chrono")
-    return configuration.parse(FitConfig, file, argv, "python -m vertiwm_jax.fit")
+    return configuration.parse_resumable(FitConfig, "fit_chrono", argv, "python -m vertiwm_jax.fit")
 
 
 def _open(resume: Path | None, runs: Path, settings: FitConfig) -> Run:

@@ -1,6 +1,5 @@
 """`python -m vertiwm_jax.ppo`: train a driving policy by PPO and show how well it drives."""
 
-import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -94,11 +93,7 @@ def learned(config: TrainConfig, terrain: TerrainMap, run: Path) -> Rows:
 
 
 def _configuration(argv: Sequence[str] | None) -> TrainConfig:
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--resume", type=Path)
-    resume = first.parse_known_args(argv)[0].resume
-    file = resume / "config.yaml" if resume else configuration.default_config("ppo")
-    return configuration.parse(TrainConfig, file, argv, "python -m vertiwm_jax.ppo")
+    return configuration.parse_resumable(TrainConfig, "ppo", argv, "python -m vertiwm_jax.ppo")
 
 
 def algorithm(config: TrainConfig, env: NavigationEnv) -> PPO:

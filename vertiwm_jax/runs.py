@@ -31,11 +31,13 @@ class RunError(RuntimeError):
 class Run:
     """One run's folder: `config.yaml`, `metrics.jsonl`, TensorBoard events, and what doors add.
 
-    Made by `Run.create` and continued by `Run.open`.
+    Made by `Run.create` and continued by `Run.open`. `outermost` is the folder to continue: that of
+    the run that this is a `part` of, or its own.
     """
 
     def __init__(self, folder: Path, events: EventsWriter) -> None:
         self.folder = folder
+        self.outermost = folder
         self._events = events
 
     @classmethod
@@ -73,13 +75,16 @@ class Run:
     def part(self, name: str, step: int, settings: Any) -> Self:
         """A run in the folder `name` inside this one: made, or continued like `open` does."""
         folder = self.folder / name
-        if (folder / METRICS).is_file():
-            return self.open(folder, step, settings)
         try:
-            folder.mkdir(exist_ok=True)
-            return self._begin(folder, settings)
+            if (folder / METRICS).is_file():
+                part = self.open(folder, step, settings)
+            else:
+                folder.mkdir(exist_ok=True)
+                part = self._begin(folder, settings)
         except OSError as error:
             raise RunError(f"{folder}: cannot start a run there: {error}") from error
+        part.outermost = self.outermost
+        return part
 
     @classmethod
     def _begin(cls, folder: Path, settings: Any) -> Self:

@@ -129,7 +129,7 @@ def train(
     if done < iterations:
         raise TrainingInterrupted(
             f"stopped after iteration {done} of {iterations}, all saved; "
-            f"go on with --resume {run.folder}"
+            f"go on with --resume {run.outermost}"
         )
     return state
 

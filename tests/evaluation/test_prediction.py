@@ -171,8 +171,10 @@ def test_error_is_found_where_it_is():
     mud = found["ground under the vehicle", "mud"]
     assert mud.windows == np.mean(start > 0) and mud.error == pytest.approx(0.7)
     assert found["belly", "on the ground"].mean == 4.0
-    assert found["border of soil, m away", "from 8"].windows == 0.5
+    assert found["border of soil, m away", "8 and more"].windows == 0.5
     assert found["speed at the start, m/s", "0.5 to 1.5"].mean == 1.0
+    borders = [x.value for x in shares if x.quantity.startswith("border")]
+    assert borders == ["1 to 2", "2 to 4", "8 and more"]
     for quantity in {x.quantity for x in shares}:
         parts = [x for x in shares if x.quantity == quantity]
         assert sum(x.windows for x in parts) == pytest.approx(1)

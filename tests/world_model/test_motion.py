@@ -65,3 +65,18 @@ def test_gradients_are_finite_at_rest():
     state = VehicleState.from_vector(jnp.zeros(12))
     gradient = jax.grad(lambda after: jnp.sum(motion.transition(state, after)))(state)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+def test_a_correction_moves_a_state_along_the_tangent():
+    """Against SciPy's matrix exponential of the twist, in double precision."""
+    state, rng = driving(), np.random.default_rng(1)
+    for size in (1e-3, 0.1, 1.0):
+        correction = (size * rng.uniform(-1, 1, 12)).astype(np.float32)
+        expected = np.asarray(state.pose.as_matrix(), np.float64)
+        expected = expected @ expm(wedge(correction[:6].astype(float)))
+        found = motion.corrected(state, jnp.asarray(correction))
+        np.testing.assert_allclose(found.pose.as_matrix(), expected, atol=3e-6)
+        np.testing.assert_allclose(found.velocity, state.velocity + correction[6:9], atol=1e-6)
+        rates = state.angular_velocity + correction[9:]
+        np.testing.assert_allclose(found.angular_velocity, rates, atol=1e-6)
+        np.testing.assert_allclose(motion.difference(state, found), correction, atol=3e-6)

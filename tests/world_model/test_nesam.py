@@ -4,16 +4,16 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import expm
 from world_model.examples import CONSTANTS, TINY, commands, count, driving, moved, rough
 
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.networks.soil_predictor import SoilPredictor
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.world_model import motion
-from vertiwm_jax.world_model.nesam import Nesam, calibrate, corrected, difference
+from vertiwm_jax.world_model.nesam import Nesam, calibrate
 from vertiwm_jax.world_model.sizes import BASE
 from vertiwm_jax.world_model.specialist_network import WINDOW
 
@@ -100,23 +100,6 @@ def test_untrained_is_the_simulator():
     np.testing.assert_allclose(alone.vector, expected.vector, atol=3e-4)
 
 
-def test_a_correction_moves_the_proposal_along_the_tangent():
-    """Against SciPy's matrix exponential of the twist, in double precision."""
-    state = standing()
-    rng = np.random.default_rng(1)
-    for size in (1e-3, 0.1, 1.0):
-        correction = (size * rng.uniform(-1, 1, 12)).astype(np.float32)
-        (x, y, z), (a, b, c) = correction[:3].astype(float), correction[3:6].astype(float)
-        generator = np.array([[0, -c, b, x], [c, 0, -a, y], [-b, a, 0, z], [0, 0, 0, 0]])
-        expected = np.asarray(state.pose.as_matrix(), np.float64) @ expm(generator)
-        found = corrected(state, jnp.asarray(correction))
-        np.testing.assert_allclose(found.pose.as_matrix(), expected, atol=3e-6)
-        np.testing.assert_allclose(found.velocity, state.velocity + correction[6:9], atol=1e-6)
-        rates = state.angular_velocity + correction[9:]
-        np.testing.assert_allclose(found.angular_velocity, rates, atol=1e-6)
-        np.testing.assert_allclose(difference(state, found), correction, atol=3e-6)
-
-
 def test_step_adds_what_the_network_says_in_its_scale():
     state, control = standing(), commands(16)
     # With a bias alone, the output of the network is that bias.
@@ -124,7 +107,7 @@ def test_step_adds_what_the_network_says_in_its_scale():
     network["params"]["head"]["bias"] = bias = jnp.linspace(-1, 1, 12)
     found = predicted(MODEL, replace(UNTRAINED, network=network), state, control)
     physics = predicted(Simulator(), PHYSICS, state, control)
-    expected = corrected(one(physics, 0), SCALE * bias)
+    expected = motion.corrected(one(physics, 0), SCALE * bias)
     np.testing.assert_allclose(one(found, 0).vector, expected.vector, atol=1e-5)
 
 
@@ -247,3 +230,26 @@ def test_jit_changes_nothing():
     np.testing.assert_allclose(found.vector, expected.vector, atol=1e-5)
     for a, b in zip(*map(jax.tree.leaves, (history, following)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4)
+
+
+def test_predicted_soils_are_those_of_the_predictor_wherever_it_drives():
+    """Against a map whose every soil is what the predictor says of the latent."""
+    state, control = standing(), commands(1)
+    model = Nesam(TINY, residual=False, soil="predicted")
+    perception = model.init(PARAMS, TERRAIN, state).perception
+    soil = SoilPredictor().apply(PARAMS.soil, perception.semantic, jnp.float32(0))
+    soils = jax.tree.map(lambda x: jnp.broadcast_to(x, TERRAIN.deformable.shape), soil)
+    soils = replace(soils, unit_weight=TERRAIN.soils.unit_weight)
+    told = replace(TERRAIN, soils=soils, deformable=jnp.ones_like(TERRAIN.deformable))
+    soft = replace(TERRAIN, deformable=told.deformable)
+    physics = Nesam(TINY, residual=False)
+    found, expected, other = (
+        run(PARAMS, terrain, run_init(PARAMS, terrain, state), state, one(control, 0))[0].vector
+        for run, run_init, terrain in (
+            (model.step, model.init, soft),
+            (physics.step, physics.init, told),
+            (physics.step, physics.init, soft),
+        )
+    )
+    np.testing.assert_array_equal(found, expected)
+    assert float(jnp.abs(found - other).max()) > 1e-5

@@ -53,7 +53,7 @@ def locate(test: TestWindows, error: np.ndarray) -> list[Share]:
     return [
         _share(name, value, np.array([v == value for v in values]), error)
         for name, values in quantities.items()
-        for value in sorted(set(values))
+        for value in sorted(set(values), key=_order)
     ]
 
 
@@ -81,8 +81,14 @@ def _share(quantity: str, value: str, rows: np.ndarray, error: np.ndarray) -> Sh
 def _binned(values: np.ndarray, edges: tuple[float, ...]) -> list[str]:
     names = [f"below {edges[0]:g}"]
     names += [f"{low:g} to {high:g}" for low, high in itertools.pairwise(edges)]
-    names.append(f"from {edges[-1]:g}")
+    names.append(f"{edges[-1]:g} and more")
     return [names[i] for i in np.digitize(values, edges)]
+
+
+def _order(value: str) -> tuple[float, str]:
+    """Sorts bins by their lower edge, and names by the alphabet."""
+    first = value.split()[0]
+    return (float(first) if first.replace(".", "").isdecimal() else 0.0), value
 
 
 @jax.jit

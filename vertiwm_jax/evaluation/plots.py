@@ -123,7 +123,7 @@ def error_growth(
                 colour, dash = _line(i)
                 seconds = step_seconds * (1 + np.arange(len(by_kind[kind])))
                 axes.plot(seconds, by_kind[kind], dash, label=name, color=colour)
-            axes.set(title=kind, xlabel="time [s]", xlim=(0, None), ylim=(0, None))
+            axes.set(title=kind, xlabel="time [s]", xlim=(0, None), yscale="log")
         panels[0].set_ylabel("position error [m]")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
     return figure

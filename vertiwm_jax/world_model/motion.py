@@ -59,3 +59,14 @@ def moved(state: VehicleState, increment: jax.Array, twist: jax.Array) -> Vehicl
         velocity=twist[..., :3],
         angular_velocity=twist[..., 3:],
     )
+
+
+def difference(expected: VehicleState, state: VehicleState) -> jax.Array:
+    """`[..., 12]` between states: increment in the first's body frame (m, rad), then velocities."""
+    change = twist(state) - twist(expected)
+    return jnp.concatenate([increment(expected, state), change], axis=-1)
+
+
+def corrected(state: VehicleState, correction: jax.Array) -> VehicleState:
+    """A state moved by a `[..., 12]` correction: the inverse of `difference`."""
+    return moved(state, correction[..., :6], twist(state) + correction[..., 6:])

@@ -35,7 +35,8 @@ NUDGE = 0.05
 class NesamParams:
     """network: what is learned; encoders: frozen by default; soil: weights of the `SoilPredictor`.
 
-    correction_scale: `[12]` root mean square of what physics misses in a step (`difference`).
+    correction_scale: `[12]` root mean square of what physics misses in a step, as
+        `motion.difference` has it.
     response: `[12, 6]` change of a proposed `motion.transition` per change of the velocities that
         it starts from, as physics typically has it.
     Both are measured by `calibrate`, and never learned.
@@ -152,7 +153,7 @@ class Nesam:
             ),
         )
         correction = _fixed(params.correction_scale) * output
-        return corrected(physics, correction), replace(following, cache=cache)
+        return motion.corrected(physics, correction), replace(following, cache=cache)
 
     def perceive(self, params: NesamParams, patches: Patches) -> Perception:
         """The patches as its encoders see them."""
@@ -178,7 +179,7 @@ class Nesam:
         seen = jax.vmap(lambda state: self._look(params, terrain, state))(states)
         ground = seen.latent if self.reads_patches else None
         output = cast(jax.Array, self._network.apply(params.network, features, ground))
-        return corrected(physics, _fixed(params.correction_scale) * output)
+        return motion.corrected(physics, _fixed(params.correction_scale) * output)
 
     def physics_along(
         self,
@@ -241,17 +242,6 @@ class Nesam:
         return jax.tree.map(lambda x, y: x + (y - _fixed(y)), proposed, tracked), memory
 
 
-def difference(expected: VehicleState, state: VehicleState) -> jax.Array:
-    """`[..., 12]` between states: increment in the first's body frame (m, rad), then velocities."""
-    change = motion.twist(state) - motion.twist(expected)
-    return jnp.concatenate([motion.increment(expected, state), change], axis=-1)
-
-
-def corrected(state: VehicleState, correction: jax.Array) -> VehicleState:
-    """A state moved by a `[..., 12]` correction: the inverse of `difference`."""
-    return motion.moved(state, correction[..., :6], motion.twist(state) + correction[..., 6:])
-
-
 def calibrate(
     model: Nesam, params: NesamParams, terrain: TerrainMap, states: VehicleState, commands: Command
 ) -> NesamParams:
@@ -281,7 +271,7 @@ def calibrate(
         # Differences over about what physics misses: at a point, contacts are either on or off.
         nudges = NUDGE * jnp.concatenate([jnp.eye(6), -jnp.eye(6)])
         above, below = jnp.split(jax.vmap(answer)(motion.twist(start) + nudges), 2)
-        return jax.vmap(difference)(proposed, after), (above - below).T / (2 * NUDGE)
+        return jax.vmap(motion.difference)(proposed, after), (above - below).T / (2 * NUDGE)
 
     missed, response = jax.vmap(one)(terrain.world, states, commands)
     # A few crashes would make up most of the squares.
@@ -309,7 +299,7 @@ def _features(
         constants.state(state.vector),
         constants.command(command.vector),
         motion.transition(state, physics) / _fixed(constants.transition_deviation),
-        difference(expected, state) / _fixed(params.correction_scale),
+        motion.difference(expected, state) / _fixed(params.correction_scale),
         jnp.arcsinh(slip),
         (memory.travel - vehicle.free_travel) / TRAVEL,
         memory.steering[..., None] / vehicle.steering_limit,

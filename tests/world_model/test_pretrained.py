@@ -1,0 +1,43 @@
+"""The model that comes with the package, on drives of the repository's own test split."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vertiwm_jax.evaluation import prediction
+from vertiwm_jax.evaluation.prediction import TestWindows
+from vertiwm_jax.learning import dataset
+from vertiwm_jax.world_model.choice import choose
+from vertiwm_jax.world_model.model import VertiWM
+
+MIXED = Path(__file__).parents[2] / "data" / "open" / "mixed"
+
+
+@pytest.fixture(scope="module")
+def windows():
+    drives, terrain = dataset.load(MIXED, "test")
+    return TestWindows.of(drives, terrain, context=16, horizon=16, stride=32)
+
+
+def mean_error(name, windows):
+    errors, lost = prediction.absolute_errors(*choose(name), windows)
+    assert not lost.any(), name
+    return errors["position"][:, -1].mean()
+
+
+def test_it_predicts_better_than_what_it_is_made_of(windows):
+    error = {name: mean_error(name, windows) for name in ("vertiwm", "nesam", "builtin")}
+    assert error["nesam"] < 0.7 * error["builtin"]
+    assert error["vertiwm"] < 1.02 * error["nesam"]
+    assert error["vertiwm"] < 0.2
+
+
+def test_its_weights_are_finite_and_few():
+    _, params = VertiWM.pretrained()
+    assert sum(x.size for x in jax.tree.leaves(params.gate.network)) == 33_764
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(params))
+    assert {x.dtype for x in jax.tree.leaves(params)} == {jnp.dtype("float32")}
+    assert sum(x.size for x in jax.tree.leaves(params)) * 4 < 10e6
