@@ -10,6 +10,7 @@ import chex
 import jax
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from vertiwm_jax import checkpoints, evaluate, ppo, runs
 from vertiwm_jax import config as configuration
@@ -55,6 +56,7 @@ def train(folder):
 
     yield train
     jax.config.update("jax_compilation_cache_dir", None)
+    compilation_cache.reset_cache()  # Else later tests go on writing to it.
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
-from vertiwm_jax import fit, runs
+from vertiwm_jax import evaluate, fit, runs
+from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.state import Command, VehicleState
@@ -67,6 +69,7 @@ def fitted(folder):
 
     yield fitted
     jax.config.update("jax_compilation_cache_dir", None)
+    compilation_cache.reset_cache()  # Else later tests go on writing to it.
 
 
 @pytest.fixture(scope="module")
@@ -127,12 +130,39 @@ def test_stages_that_have_ended_are_not_repeated(run, fitted, capsys):
         assert (run / stage / "fitted").stat().st_mtime_ns == times[stage], stage
 
 
+def test_one_specialist_alone_is_fitted_and_compared(fitted, folder, tmp_path, capsys):
+    parts = ["--model.parts", "transformer", "--model.terrain"]
+    run = fitted(*parts, "none")
+    stages = {path.name for path in run.iterdir() if path.is_dir()}
+    assert stages == {"transformer_single_steps", "transformer_rollouts", "model"}
+    capsys.readouterr()
+    command = ["prediction", "--data", str(folder / "drives" / "deformable")]
+    command += ["--context", "2", "--horizon", "3", "--stride", "50", "--models", "builtin"]
+    evaluate.main([*command, "--compare", str(run / "model")])
+    assert f"| {run / 'model'}: transformer | " in capsys.readouterr().out
+    with pytest.raises(CheckpointError, match="expected vertiwm, found transformer alone"):
+        choose("vertiwm", run / "model")
+
+
+@pytest.mark.parametrize(
+    "settings, words",
+    [
+        ({"parts": ()}, "at least one"),
+        ({"parts": ("gate", "nesam")}, "both specialists"),
+        ({"terrain": "none"}, "patches for the gate"),
+    ],
+)
+def test_models_without_sense_are_refused(settings, words):
+    with pytest.raises(ValueError, match=words):
+        model.ModelConfig(**settings)
+
+
 def test_what_cannot_be_fitted_is_named(run, folder, tmp_path):
     message = refusal("--data", tmp_path, "--runs", tmp_path / "runs")
     assert "expected files of drives, or folders of them named rigid" in message
     again = shutil.copytree(run, tmp_path / "again")
     message = refusal("--resume", again, "--model.gate-terrain", "both")
     assert "gate" in message and "belongs to another configuration" in message
-    with pytest.raises(model.checkpoints.CheckpointError, match="weights of a model"):
+    with pytest.raises(CheckpointError, match="weights of a model"):
         shutil.rmtree(again / "model" / "0")
         model.load(again / "model")

@@ -27,7 +27,7 @@ from vertiwm_jax.rl import ground, task
 from vertiwm_jax.runs import RunError
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.worlds import Difficulty
-from vertiwm_jax.world_model.choice import ModelName, choose
+from vertiwm_jax.world_model.choice import ModelName, choose, fitted
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,8 @@ class Prediction:
     """The models."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
+    compare: tuple[Path, ...] = ()
+    """Folders of other fitted models, of which each part is a row."""
     split: dataset.Split = "test"
     """Which of the drives."""
     context: int = 16
@@ -106,6 +108,11 @@ def _predict(command: Prediction) -> None:
         sys.exit(f"error: {error}")
     models: dict[str, tuple[Dynamics, Params]] = {
         **{name: choose(name, command.weights) for name in command.models},
+        **{
+            f"{folder}: {name}": chosen
+            for folder in command.compare
+            for name, chosen in fitted(folder).items()
+        },
         "kinematic bicycle": (KinematicBicycle(), bicycle_of(hmmwv())),
         "constant velocity": (ConstantVelocity(), None),
     }

@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         settings = replace(config, resume=None)
         with _open(config.resume, config.runs, settings) as run:
             print(f"run folder {run.folder}", flush=True)
-            _, params = pipeline.fit(config, config.data, jax.random.key(config.seed), run)
+            params = pipeline.fit(config, config.data, jax.random.key(config.seed), run)
             model.save(run.folder / "model", config.model, params)
     except TrainingInterrupted as stopped:
         print(stopped)

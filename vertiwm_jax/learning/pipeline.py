@@ -90,23 +90,24 @@ class PipelineConfig:
     """What fuses the two."""
 
 
-def fit(
-    config: PipelineConfig, folders: Sequence[Path], key: jax.Array, run: Run
-) -> tuple[VertiWM, VertiWMParams]:
-    """All stages in turn; folders hold drives, or folders of drives named like `KINDS`.
+def fit(config: PipelineConfig, folders: Sequence[Path], key: jax.Array, run: Run) -> VertiWMParams:
+    """All stages of the configured parts; gives their parameters, and others untrained.
 
-    Raises what `dataset.load`, `WindowData.of` and `fitting.fit` raise.
+    folders: of drives, or of folders of drives named like `KINDS`. Raises what `dataset.load`,
+    `WindowData.of` and `fitting.fit` raise.
     """
     stages = _Stages(config, tuple(folders), key, run)
-    verti_wm = config.model.build()
+    built, parts = config.model, config.model.parts
     constants = normalisation.measure(stages.load(KINDS, "train")[0])
-    params = config.model.init_params(key, chrono_like(hmmwv()), constants)
-    second = stages.specialist("nesam", config.model.nesam, params.nesam, config.nesam)
-    first = stages.specialist(
-        "transformer", config.model.transformer, params.transformer, config.transformer
-    )
-    params = replace(params, transformer=first, nesam=second)
-    return verti_wm, stages.gate(verti_wm, params)
+    params = built.init_params(key, chrono_like(hmmwv()), constants)
+    if "nesam" in parts:
+        second = stages.specialist("nesam", built.nesam, params.nesam, config.nesam)
+        params = replace(params, nesam=second)
+    if "transformer" in parts:
+        settings = config.transformer
+        first = stages.specialist("transformer", built.transformer, params.transformer, settings)
+        params = replace(params, transformer=first)
+    return stages.gate(built.build(), params) if "gate" in parts else params
 
 
 @dataclass(frozen=True)
@@ -127,17 +128,19 @@ class _Stages:
     ) -> Any:
         """Its encoders, then for NeSAM what soils look like, then how it moves."""
         drives = self._drives(config.learns_from)
-        patches = replace(self.config.patches, patches=specialist.exteroception.patches)
-        places = cache(lambda: PatchData.of(patches, *drives()))
-        problem = AutoencoderProblem(patches)
-        pair = problem.init_params(self._key(name))
-        pair = self._fit(f"{name}_autoencoders", problem, config.autoencoders, pair, places)
-        params = replace(params, encoders=autoencoders.encoders(pair))
+        if params.encoders is not None:
+            patches = replace(self.config.patches, patches=specialist.exteroception.patches)
+            places = cache(lambda: PatchData.of(patches, *drives()))
+            problem = AutoencoderProblem(patches)
+            pair = problem.init_params(self._key(name))
+            pair = self._fit(f"{name}_autoencoders", problem, config.autoencoders, pair, places)
+            params = replace(params, encoders=autoencoders.encoders(pair))
+            if isinstance(specialist, Nesam):
+                looks = {"encoders": params.encoders, "soil": params.soil}
+                problem = SoilProblem(patches)
+                looks = self._fit(f"{name}_soil", problem, self.config.soil, looks, places)
+                params = replace(params, soil=looks["soil"])
         if isinstance(specialist, Nesam):
-            looks = {"encoders": params.encoders, "soil": params.soil}
-            problem = SoilProblem(patches)
-            looks = self._fit(f"{name}_soil", problem, self.config.soil, looks, places)
-            params = replace(params, soil=looks["soil"])
             params = nesam.calibrate(specialist, params, *self._sample(drives))
 
         data = cache(lambda: WindowData.of(self.config.windows, *drives()))

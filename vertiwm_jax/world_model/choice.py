@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
+from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
@@ -16,13 +17,25 @@ def choose(name: ModelName, weights: Path | None = None) -> tuple[Dynamics, Para
     """The model and its parameters, for Chrono's HMMWV.
 
     weights: folder of a fitted model; the one that comes with the package by default. Raises what
-    `model.load` raises.
+    `model.load` raises, and `CheckpointError` when it holds other parts alone.
     """
     if name == "builtin":
         return Simulator(), chrono_like(hmmwv())
-    fused, params = model.load(weights or model.PRETRAINED)
-    return {
-        "transformer": (fused.transformer, params.transformer),
-        "nesam": (fused.nesam, params.nesam),
-        "vertiwm": (fused, params),
-    }[name]
+    folder = weights or model.PRETRAINED
+    found = fitted(folder)
+    if name not in found:
+        raise CheckpointError(f"{folder}: expected {name}, found {' and '.join(found)} alone")
+    return found[name]
+
+
+def fitted(folder: Path) -> dict[ModelName, tuple[Dynamics, Params]]:
+    """The models that are fitted in a folder, and their parameters; raises like `model.load`."""
+    config, params = model.load(folder)
+    models: dict[ModelName, tuple[Dynamics, Params]] = {}
+    if "gate" in config.parts:
+        models["vertiwm"] = (config.build(), params)
+    if "nesam" in config.parts:
+        models["nesam"] = (config.nesam, params.nesam)
+    if "transformer" in config.parts:
+        models["transformer"] = (config.transformer, params.transformer)
+    return models

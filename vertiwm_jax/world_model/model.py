@@ -24,6 +24,7 @@ from vertiwm_jax.world_model.perception import Perception, Specialist
 from vertiwm_jax.world_model.sizes import BASE, PAPER
 from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
 
+Part = Literal["transformer", "nesam", "gate"]
 PRETRAINED = Path(__file__).parents[1] / "weights"
 """Folder of the model that comes with the package; its model card is `docs/model_card.md`."""
 _CONFIG = "model.yaml"
@@ -78,8 +79,12 @@ class VertiWMHistory:
 class ModelConfig:
     """Which model: what `VertiWM` is made of, in a form that a file can hold."""
 
+    parts: tuple[Part, ...] = ("transformer", "nesam", "gate")
+    """What of it is fitted; each part can be used alone, the gate needs both others."""
     size: Literal["base", "paper"] = "base"
     """Of both specialists' networks."""
+    terrain: Literal["patches", "indicator", "none"] = "patches"
+    """What the Transformer is told of the ground; less than patches only to compare with."""
     reads_patches: bool = False
     """Whether NeSAM's correction sees encoded patches beside what physics makes of the ground."""
     soil: Literal["map", "predicted"] = "map"
@@ -89,10 +94,18 @@ class ModelConfig:
     coefficients: Literal["grouped", "scalar"] = "grouped"
     """Fusion coefficients for four groups of motion, or one for all."""
 
+    def __post_init__(self):
+        if not self.parts:
+            raise ValueError("parts: expected at least one, found none")
+        if "gate" in self.parts and len(set(self.parts)) < 3:
+            raise ValueError(f"parts: expected both specialists with the gate, found {self.parts}")
+        if "gate" in self.parts and self.terrain != "patches":
+            raise ValueError(f"terrain: expected patches for the gate, found {self.terrain!r}")
+
     @property
     def transformer(self) -> TransformerSpecialist:
         """The specialist for rigid ground."""
-        return TransformerSpecialist(_SIZES[self.size])
+        return TransformerSpecialist(_SIZES[self.size], self.terrain)
 
     @property
     def nesam(self) -> Nesam:
@@ -145,8 +158,8 @@ class VertiWM:
     @classmethod
     def pretrained(cls) -> tuple[Self, VertiWMParams]:
         """The model that comes with the package, for a HMMWV, and its parameters."""
-        model, params = load(PRETRAINED)
-        return cast(Self, model), params
+        config, params = load(PRETRAINED)
+        return cast(Self, config.build()), params
 
     def init(
         self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState
@@ -276,8 +289,8 @@ def save(folder: Path, config: ModelConfig, params: VertiWMParams) -> None:
     configuration.save(config, folder / _CONFIG)
 
 
-def load(folder: Path) -> tuple[VertiWM, VertiWMParams]:
-    """The model that `save` wrote to `folder`.
+def load(folder: Path) -> tuple[ModelConfig, VertiWMParams]:
+    """What `save` wrote to `folder`; parts that are not among the configured ones are untrained.
 
     `ConfigError` or `CheckpointError` when it holds none, or one of another version.
     """
@@ -288,4 +301,4 @@ def load(folder: Path) -> tuple[VertiWM, VertiWMParams]:
     like = jax.eval_shape(
         lambda key: config.init_params(key, chrono_like(hmmwv())), jax.random.key(0)
     )
-    return config.build(), checkpoints.load(path, like)
+    return config, checkpoints.load(path, like)
