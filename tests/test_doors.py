@@ -10,7 +10,7 @@ import chex
 import jax
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
+from doors import opened, refusal
 
 from vertiwm_jax import checkpoints, evaluate, ppo, runs
 from vertiwm_jax import config as configuration
@@ -46,32 +46,14 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def train(folder):
     """Runs the door, with the tiny settings first; gives the newest run folder."""
-
-    def train(*argv):
-        # What one training has compiled, the next finds there.
-        common = ["--runs", str(folder / "runs"), "--compile-cache", str(folder / "compiled")]
-        first = [] if "--resume" in argv else ["--config", str(folder / "tiny.yaml"), *common]
-        ppo.main([*first, *argv])
-        return max((folder / "runs").iterdir(), key=lambda run: run.stat().st_ctime_ns)
-
-    yield train
-    jax.config.update("jax_compilation_cache_dir", None)
-    compilation_cache.reset_cache()  # Else later tests go on writing to it.
+    with opened(ppo.main, folder, "--config", str(folder / "tiny.yaml")) as train:
+        yield train
 
 
 @pytest.fixture(scope="module")
 def run(train):
     """A finished training."""
     return train()
-
-
-def refusal(door, *argv):
-    """The one line that a door ends in."""
-    with pytest.raises(SystemExit) as stop:
-        door([str(word) for word in argv])
-    message = stop.value.code
-    assert isinstance(message, str) and message.startswith("error: ") and "\n" not in message
-    return message
 
 
 def numbers(run):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
+from doors import opened, refusal
 
 from vertiwm_jax import evaluate, fit, runs
 from vertiwm_jax.checkpoints import CheckpointError
@@ -59,30 +59,14 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def fitted(folder):
     """Runs the door; gives the newest run folder."""
-
-    def fitted(*argv):
-        cache = ["--compile-cache", str(folder / "compiled")]
-        first = ["--config", str(folder / "tiny.yaml"), "--data", str(folder / "drives")]
-        first += ["--runs", str(folder / "runs")]
-        fit.main([*([] if "--resume" in argv else first), *cache, *argv])
-        return max((folder / "runs").iterdir(), key=lambda run: run.stat().st_ctime_ns)
-
-    yield fitted
-    jax.config.update("jax_compilation_cache_dir", None)
-    compilation_cache.reset_cache()  # Else later tests go on writing to it.
+    tiny, drives = folder / "tiny.yaml", folder / "drives"
+    with opened(fit.main, folder, "--config", str(tiny), "--data", str(drives)) as fitted:
+        yield fitted
 
 
 @pytest.fixture(scope="module")
 def run(fitted):
     return fitted()
-
-
-def refusal(*argv):
-    with pytest.raises(SystemExit) as stop:
-        fit.main([str(word) for word in argv])
-    message = stop.value.code
-    assert isinstance(message, str) and message.startswith("error: ") and "\n" not in message
-    return message
 
 
 def test_every_stage_leaves_its_metrics_and_all_together_a_model(run, folder):
@@ -158,10 +142,10 @@ def test_models_without_sense_are_refused(settings, words):
 
 
 def test_what_cannot_be_fitted_is_named(run, folder, tmp_path):
-    message = refusal("--data", tmp_path, "--runs", tmp_path / "runs")
+    message = refusal(fit.main, "--data", tmp_path, "--runs", tmp_path / "runs")
     assert "expected files of drives, or folders of them named rigid" in message
     again = shutil.copytree(run, tmp_path / "again")
-    message = refusal("--resume", again, "--model.gate-terrain", "both")
+    message = refusal(fit.main, "--resume", again, "--model.gate-terrain", "both")
     assert "gate" in message and "belongs to another configuration" in message
     with pytest.raises(CheckpointError, match="weights of a model"):
         shutil.rmtree(again / "model" / "0")

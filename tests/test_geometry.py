@@ -96,6 +96,17 @@ def test_roll_pitch_yaw_agree_with_scipy(roll, pitch, yaw):
     np.testing.assert_allclose(error, 0, atol=3e-5)
 
 
+@pytest.mark.parametrize("pitch", [-np.pi / 2, np.pi / 2])
+def test_pitch_is_finite_when_the_nose_points_straight_down_or_up(pitch):
+    yaw = np.linspace(-3, 3, 1001, dtype=np.float32)
+    rpy = np.stack([0.3 * yaw, np.full_like(yaw, pitch), yaw], axis=-1)
+    back = np.asarray(rpy_there_and_back(rpy))
+    np.testing.assert_allclose(back[:, 1], pitch, atol=1e-3)
+    assert np.isfinite(back).all()
+    slope = jax.jacfwd(rpy_there_and_back)(rpy[500])
+    assert np.isfinite(slope).all()
+
+
 def test_the_body_frame_points_as_the_conventions_say():
     nose_down = geometry.rotation_from_rpy(jnp.array([0.0, 0.3, 0.0]))
     assert (nose_down @ jnp.array([1.0, 0.0, 0.0]))[2] < 0

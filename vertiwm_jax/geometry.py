@@ -9,6 +9,9 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 
+_LARGEST_SINE = 1 - 2**-24
+"""The largest float32 below one, where the slope of the inverse sine is still finite."""
+
 
 def wrap(angle: jax.Array) -> jax.Array:
     """`[...]` angles in rad, mapped to [-pi, pi)."""
@@ -21,9 +24,14 @@ def rotation_from_rpy(rpy: jax.Array) -> jaxlie.SO3:
 
 
 def rpy_from_rotation(rotation: jaxlie.SO3) -> jax.Array:
-    """The rotation from body to world to `[..., 3]` roll, pitch, yaw in rad."""
-    rpy = rotation.as_rpy_radians()
-    return jnp.stack([rpy.roll, rpy.pitch, rpy.yaw], axis=-1)
+    """The rotation from body to world to `[..., 3]` roll, pitch, yaw in rad.
+
+    Finite at every attitude; jaxlie's pitch is NaN where rounding lifts its sine above one.
+    """
+    w, x, y, z = jnp.moveaxis(rotation.wxyz, -1, 0)
+    pitch = jnp.arcsin(jnp.clip(2 * (w * y - z * x), -_LARGEST_SINE, _LARGEST_SINE))
+    roll, yaw = rotation.compute_roll_radians(), rotation.compute_yaw_radians()
+    return jnp.stack([roll, pitch, yaw], axis=-1)
 
 
 def pose_from_rpy(position: jax.Array, rpy: jax.Array) -> jaxlie.SE3:

@@ -9,6 +9,7 @@ import pytest
 
 from vertiwm_jax import runs
 from vertiwm_jax.evaluation import prediction
+from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset, fitting, rollouts, windows
 from vertiwm_jax.learning.fitting import FitConfig
 from vertiwm_jax.learning.losses import LossConfig, step_loss, trajectory_loss
@@ -149,13 +150,14 @@ def test_validation_is_the_error_of_the_tables(data):
     params = bicycle_of(hmmwv())
     problem = WindowProblem(BICYCLE, OpenLoop(BICYCLE), CONFIG)
     found = jax.jit(problem.validate)(params, data)
-    table = prediction.evaluate(
-        "bicycle", BICYCLE, params, data.validation_terrain, data.validation
-    )
+    drive = np.arange(len(data.validation.world))
+    test = TestWindows(data.validation, drive, data.validation_terrain)
+    table = prediction.evaluate("bicycle", BICYCLE, params, test)
     assert table.count == {"rigid": 10, "deformable": 10, "transition": 10}
-    for kind, mean in table.mean.items():
+    means = {kind: interval.mean for kind, interval in table.final["position"].items()}
+    for kind, mean in means.items():
         assert float(found[f"error_{kind}"]) == pytest.approx(mean, rel=1e-4)
-    assert float(found["error"]) == pytest.approx(np.mean(list(table.mean.values())), rel=1e-4)
+    assert float(found["error"]) == pytest.approx(np.mean(list(means.values())), rel=1e-4)
     assert found["diverged"] == 0
 
 

@@ -421,8 +421,7 @@ def test_a_batch_is_a_loop_and_commands_do_not_retrace():
     batched(batch, jax.tree.map(lambda c: 0.5 * c, commands))
     assert traces == 1
     for i, start in enumerate(starts):
-        command = jax.tree.map(lambda c: c[i], commands)  # noqa: B023
-        alone = drive(terrain, start, command.speed[0], command.steering[0])
+        alone = drive(terrain, start, commands.speed[i, 0], commands.steering[i, 0])
         np.testing.assert_allclose(together.position[i], alone.state.position, atol=0.01)
 
 

@@ -60,3 +60,26 @@ def moved(params, seed: int = 0):
 
 def count(params) -> int:
     return sum(x.size for x in jax.tree.leaves(params))
+
+
+def one(tree, i):
+    """What stands at a place of the first axis of every leaf."""
+    return jax.tree.map(lambda x: x[i], tree)
+
+
+def check_batches(predict, states, controls, tolerance: float) -> None:
+    """`predict(state, commands)` of B drives at once is what it gives of each, by one program."""
+    alone, traces = jax.jit(predict), 0
+
+    def counted(state, commands):
+        nonlocal traces
+        traces += 1
+        return predict(state, commands)
+
+    together = jax.jit(jax.vmap(counted))
+    batch = together(states, controls)
+    together(one(states, slice(None, None, -1)), controls)
+    assert traces == 1
+    for i in range(len(controls.speed)):
+        expected = alone(one(states, i), one(controls, i))
+        np.testing.assert_allclose(one(batch, i).vector, expected.vector, atol=tolerance)

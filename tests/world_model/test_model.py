@@ -7,7 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
-from world_model.examples import CONSTANTS, TINY, commands, count, driving, moved, rough
+from world_model.examples import (
+    CONSTANTS,
+    TINY,
+    check_batches,
+    commands,
+    count,
+    driving,
+    moved,
+    rough,
+)
 
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
@@ -218,23 +227,10 @@ def test_jit_changes_nothing():
 
 
 def test_a_batch_is_a_loop_and_one_trace_serves_all_drives():
-    traces = 0
+    def predict(state, control):
+        return fuse(PARAMS, TERRAIN, state, control)[0]
 
-    @jax.jit
-    @jax.vmap
-    def together(state, commands):
-        nonlocal traces
-        traces += 1
-        return fuse(PARAMS, TERRAIN, state, commands)
-
-    states, controls = driving(2, 3), commands(12, 3)
-    batch, _ = together(states, controls)
-    together(driving(3, 3), commands(12, 3, seed=1))
-    assert traces == 1
-    for i in range(3):
-        state, control = jax.tree.map(lambda x: x[i], (states, controls))  # noqa: B023
-        one, _ = fused(PARAMS, TERRAIN, state, control)
-        np.testing.assert_allclose(batch.vector[i], one.vector, atol=1e-3)
+    check_batches(predict, driving(2, 3), commands(12, 3), 1e-3)
 
 
 def test_proposals_reach_the_fused_state_but_not_the_gate_with_gradients():

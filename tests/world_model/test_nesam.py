@@ -4,7 +4,17 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from world_model.examples import CONSTANTS, TINY, commands, count, driving, moved, rough
+from world_model.examples import (
+    CONSTANTS,
+    TINY,
+    check_batches,
+    commands,
+    count,
+    driving,
+    moved,
+    one,
+    rough,
+)
 
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
@@ -73,10 +83,6 @@ def compiled(model):
 def predicted(model, params, state, control, terrain=TERRAIN):
     """The 16 states after `state`."""
     return compiled(model)(params, state, control, terrain)
-
-
-def one(states, i):
-    return jax.tree.map(lambda x: x[i], states)
 
 
 def test_base_size():
@@ -204,22 +210,7 @@ def test_the_mean_gradient_is_exact_where_physics_answers_alike_everywhere():
 
 
 def test_a_batch_is_a_loop_and_one_trace_serves_all_drives():
-    traces = 0
-
-    @jax.jit
-    @jax.vmap
-    def together(state, commands):
-        nonlocal traces
-        traces += 1
-        return predict(SIMPLE, PARAMS, state, commands)
-
-    states, controls = standing(2, 3), commands(16, 3)
-    batch = together(states, controls)
-    together(standing(3, 3), commands(16, 3, seed=1))
-    assert traces == 1
-    for i in range(3):
-        alone = predicted(SIMPLE, PARAMS, one(states, i), one(controls, i))
-        np.testing.assert_allclose(one(batch, i).vector, alone.vector, atol=1e-3)
+    check_batches(partial(predict, SIMPLE, PARAMS), standing(2, 3), commands(16, 3), 1e-3)
 
 
 def test_jit_changes_nothing():

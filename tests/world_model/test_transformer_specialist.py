@@ -1,10 +1,21 @@
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from world_model.examples import CONSTANTS, TINY, commands, count, driving, moved, rough
+from world_model.examples import (
+    CONSTANTS,
+    TINY,
+    check_batches,
+    commands,
+    count,
+    driving,
+    moved,
+    one,
+    rough,
+)
 
 from vertiwm_jax.dynamics import rollout, warm_up
 from vertiwm_jax.state import Command, VehicleState
@@ -60,7 +71,7 @@ def test_cached_steps_along_a_drive_equal_the_whole_sequence(kind):
             proposed, history = model.step(params, TERRAIN, history, state, command)
             return history, proposed
 
-        start = model.init(params, TERRAIN, jax.tree.map(lambda x: x[0], states))
+        start = model.init(params, TERRAIN, one(states, 0))
         return jax.lax.scan(advance, start, (states, commands))[1]
 
     one_by_one = cached(params, drive, commands(steps))
@@ -82,23 +93,8 @@ def test_history_sees_the_state_that_was_returned():
 
 
 def test_a_batch_is_a_loop_and_one_trace_serves_all_drives():
-    traces = 0
-
-    @jax.jit
-    @jax.vmap
-    def together(state, commands):
-        nonlocal traces
-        traces += 1
-        return predict(PARAMS["patches"], TERRAIN, state, commands)
-
-    states, controls = driving(2, 3), commands(8, 3)
-    batch = together(states, controls)
-    together(driving(3, 3), commands(8, 3, seed=1))
-    assert traces == 1
-    for i in range(3):
-        state, control = jax.tree.map(lambda x: x[i], (states, controls))  # noqa: B023
-        alone = predicted(PARAMS["patches"], TERRAIN, state, control)
-        np.testing.assert_allclose(batch.vector[i], alone.vector, atol=1e-4)
+    alone = partial(predict, PARAMS["patches"], TERRAIN)
+    check_batches(alone, driving(2, 3), commands(8, 3), 1e-4)
 
 
 def test_steps_in_a_host_loop_are_traced_once():
@@ -114,8 +110,7 @@ def test_steps_in_a_host_loop_are_traced_once():
     history = jax.jit(MODEL.init)(PARAMS["patches"], TERRAIN, state)
     expected = predicted(PARAMS["patches"], TERRAIN, state, control)
     for i in range(8):
-        command = jax.tree.map(lambda x: x[i], control)  # noqa: B023
-        state, history = step(PARAMS["patches"], TERRAIN, history, state, command)
+        state, history = step(PARAMS["patches"], TERRAIN, history, state, one(control, i))
     assert traces == 1
     np.testing.assert_allclose(state.vector, expected.vector[-1], atol=1e-4)
 

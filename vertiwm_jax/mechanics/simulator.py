@@ -177,13 +177,15 @@ def _substep(
     steering = history.steering + jnp.clip(target - history.steering, -turn, turn)
 
     steer = jnp.concatenate([jnp.full(2, steering), jnp.zeros(2)])
-    wheels, hull = touch(vehicle, terrain, body.position, axes, history.travel, steer)
+    before = history.sinkage
+    wheels, hull = touch(vehicle, terrain, body.position, axes, history.travel, steer, before)
     n, arm = wheels.normal, wheels.point.plus(centre, -1.0)
     rolling, lateral = _tangents(n, jnp.cos(steer), jnp.sin(steer))
     velocity = velocity_at(body.twist, arm)
     ahead, drift = velocity.dot(rolling), velocity.dot(lateral)
 
-    press = _suspend(vehicle, wheels, history.travel, history.sinkage, velocity.dot(n), seconds)
+    sunk = jnp.where(wheels.soft, before, 0.0)
+    press = _suspend(vehicle, wheels, history.travel, sunk, velocity.dot(n), seconds)
     rut = jnp.concatenate([jnp.zeros(2), history.rut])
     ground, sinkage, load, rate = _support(params, wheels, press, history, ahead, drift, rut)
 
@@ -225,7 +227,7 @@ def _substep(
             vehicle.free_travel + radius,
         ),
         steering=steering,
-        sinkage=sinkage,
+        sinkage=jnp.where(wheels.edge, before, sinkage),
         rut=history.rut + fresh * (sinkage[:2] - history.rut),
     )
     return _advance_pose(vehicle, body, axes, centre, twist, seconds), history

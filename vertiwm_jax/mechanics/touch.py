@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vertiwm_jax.mechanics.vector import Axes, Vector
 from vertiwm_jax.mechanics.vehicle import Vehicle
@@ -15,6 +16,10 @@ TREAD_ANGLES = (-0.7, -0.35, 0.0, 0.35, 0.7)
 """Where both rims of a wheel are tested against the ground, rad from straight down."""
 SHARED_DEPTH = 0.005
 """Depth, m, over which neighbouring points of a tread share a contact."""
+LEAST_SINKAGE = 0.01
+"""Depth, m, without which soil carries nothing where there is rigid ground beside it."""
+
+_RIM_ANGLES = np.repeat(np.asarray(TREAD_ANGLES, np.float32), 2)[:, None]
 
 
 class Touch(NamedTuple):
@@ -25,6 +30,7 @@ class Touch(NamedTuple):
     depth: m below the ground's tangent plane; negative above it.
     friction: coefficient of rigid ground, 0 on soil.
     soft: bool, whether the ground is soil; soil: that soil.
+    edge: bool, whether it is an edge of rigid ground on which a wheel in soil leans.
     """
 
     point: Vector
@@ -33,6 +39,17 @@ class Touch(NamedTuple):
     friction: jax.Array
     soft: jax.Array
     soil: Soil
+    edge: jax.Array
+
+
+class _Samples(NamedTuple):
+    """Points of the vehicle `[...]` against the ground below them, as in `Touch`."""
+
+    point: Vector
+    normal: Vector
+    depth: jax.Array
+    friction: jax.Array
+    semantic: jax.Array
 
 
 def touch(
@@ -42,14 +59,12 @@ def touch(
     axes: Axes,
     travel: jax.Array,
     steering: jax.Array,
+    sinkage: jax.Array,
 ) -> tuple[Touch, Touch]:
     """Contacts of the four wheels `[4]` and of the deepest hull point `[1]`, in one query.
 
-    A wheel is a cylinder. Testing points on both rims, rather than the ground under the hub,
-    lets it roll over edges and stand on a rim; neighbouring points of like depth share the
-    contact, so that it moves smoothly.
-
-    travel: `[4]` m, height of the wheel centres in the body; steering: `[4]` rad.
+    travel: `[4]` m, height of the wheel centres in the body; steering: `[4]` rad; sinkage: `[4]`
+    m, how deep the wheels are in soil already.
     """
     tread, hull = _tread(vehicle, travel, steering), Vector.of(vehicle.hull)
     shape, count = tread.x.shape, tread.x.size
@@ -58,48 +73,72 @@ def touch(
     ground = query.surface(terrain, jnp.stack([world.x, world.y], axis=-1))
     slope_x, slope_y = ground.gradient[:, 0], ground.gradient[:, 1]
     up = jax.lax.rsqrt(1 + slope_x**2 + slope_y**2)
-    normal = axes.to_body(Vector(-slope_x * up, -slope_y * up, up))
-    depth = (ground.height - world.z) * up
+    samples = _Samples(
+        point=points,
+        normal=axes.to_body(Vector(-slope_x * up, -slope_y * up, up)),
+        depth=(ground.height - world.z) * up,
+        friction=ground.friction,
+        semantic=ground.semantic,
+    )
+    on_tread = jax.tree.map(lambda x: x[:count].reshape(shape), samples)
+    deepest = count + jnp.argmax(samples.depth[count:])[None]
+    on_hull = jax.tree.map(lambda x: x[deepest], samples)
+    chassis = Touch(
+        point=on_hull.point,
+        normal=on_hull.normal,
+        depth=on_hull.depth,
+        friction=on_hull.friction,
+        soft=terrain.deformable[on_hull.semantic],
+        soil=jax.tree.map(lambda leaf: leaf[on_hull.semantic], terrain.soils),
+        edge=jnp.zeros(1, bool),
+    )
+    return _wheel_contacts(terrain, on_tread, steering, sinkage), chassis
 
-    def on_tread(values: jax.Array) -> jax.Array:
-        return values[:count].reshape(shape)
 
-    share = jax.nn.softmax(on_tread(depth) / SHARED_DEPTH, axis=0)
+def _wheel_contacts(
+    terrain: TerrainMap, tread: _Samples, steering: jax.Array, sinkage: jax.Array
+) -> Touch:
+    """One contact `[4]` of each wheel, shared by the points `[2 angles, 4]` that carry it.
 
-    def shared(values: jax.Array) -> jax.Array:
+    A wheel is a cylinder. Testing points on both rims, rather than the ground under the hub,
+    lets it roll over edges and stand on a rim; neighbouring points of like depth share the
+    contact, so that it moves smoothly. It rests on either rigid ground or soil: soil carries only
+    what has sunk into it, so rigid ground beside it is a step, whose edge pushes towards the axle.
+    """
+    soft = terrain.deformable[tread.semantic]
+    carried = tread.depth - jnp.where(soft, jnp.maximum(sinkage, LEAST_SINKAGE), 0.0)
+    share = jax.nn.softmax(carried / SHARED_DEPTH, axis=0)
+    in_soil = jnp.sum(share * soft, axis=0) > 0.5
+    share = share * (soft == in_soil)
+    share = share / jnp.sum(share, axis=0)
+
+    def shared(values: jax.Array | np.ndarray) -> jax.Array:
         return jnp.sum(share * values, axis=0)
 
-    below = on_tread(ground.semantic)[shape[0] // 2]
-    wheels = Touch(
-        point=Vector(*map(shared, tread)),
-        normal=Vector(*(shared(on_tread(c)) for c in normal)).normalised(),
-        depth=shared(on_tread(depth)),
-        friction=shared(on_tread(ground.friction)),
-        soft=terrain.deformable[below],
+    lowest = len(TREAD_ANGLES) - 1, len(TREAD_ANGLES)
+    edge = ~in_soil & soft[lowest[0]] & soft[lowest[1]]
+    ahead, up = shared(np.sin(_RIM_ANGLES)), shared(np.cos(_RIM_ANGLES))
+    to_axle = Vector(-ahead * jnp.cos(steering), -ahead * jnp.sin(steering), up).normalised()
+    upright = Vector(*map(shared, tread.normal)).normalised()
+    below = jnp.take_along_axis(tread.semantic, jnp.argmax(share, axis=0)[None], axis=0)[0]
+    return Touch(
+        point=Vector(*map(shared, tread.point)),
+        normal=Vector(*(jnp.where(edge, a, b) for a, b in zip(to_axle, upright, strict=True))),
+        depth=shared(tread.depth) * jnp.where(edge, to_axle.z, 1.0),
+        friction=shared(tread.friction),
+        soft=in_soil,
         soil=jax.tree.map(lambda leaf: leaf[below], terrain.soils),
+        edge=edge,
     )
-
-    deepest = count + jnp.argmax(depth[count:])[None]
-    under = ground.semantic[deepest]
-    chassis = Touch(
-        point=Vector(*(c[deepest] for c in points)),
-        normal=Vector(*(c[deepest] for c in normal)),
-        depth=depth[deepest],
-        friction=ground.friction[deepest],
-        soft=terrain.deformable[under],
-        soil=jax.tree.map(lambda leaf: leaf[under], terrain.soils),
-    )
-    return wheels, chassis
 
 
 def _tread(vehicle: Vehicle, travel: jax.Array, steering: jax.Array) -> Vector:
     """Points `[2 angles, 4]` on both rims of the lower half of each wheel, from the origin."""
-    angle = jnp.repeat(jnp.array(TREAD_ANGLES), 2)[:, None]
-    side = jnp.tile(jnp.array([0.5, -0.5]), len(TREAD_ANGLES))[:, None]
-    ahead, left = vehicle.wheel_radius * jnp.sin(angle), vehicle.wheel_width * side
+    side = np.tile(np.asarray([0.5, -0.5], np.float32), len(TREAD_ANGLES))[:, None]
+    ahead, left = vehicle.wheel_radius * jnp.sin(_RIM_ANGLES), vehicle.wheel_width * side
     cos, sin = jnp.cos(steering), jnp.sin(steering)
     return Vector(
         vehicle.wheel_position[:, 0] + ahead * cos - left * sin,
         vehicle.wheel_position[:, 1] + ahead * sin + left * cos,
-        travel - vehicle.wheel_radius * jnp.cos(angle) + 0 * left,
+        travel - vehicle.wheel_radius * jnp.cos(_RIM_ANGLES) + 0 * left,
     )
