@@ -29,6 +29,7 @@ ground: {train_worlds: 2, held_out_worlds: 2, starts: 8, pairs: 2}
 navigation: {horizon_seconds: 3, settle_steps: 2}
 simulator: {substeps: 1}
 action_repeat: 2
+planning: {candidates: 2, decisions: 1, model: builtin}
 ppo:
   {transitions: 256, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1, hidden: [8],
    schedule: constant}
@@ -81,7 +82,8 @@ def test_a_run_leaves_all_that_was_promised(run, folder):
     assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["2", "4"]
     summary = json.loads((run / "summary.json").read_text())
     for difficulty, rows in summary.items():
-        assert list(rows) == ["ppo", "look ahead", "straight to goal", "random"]
+        policies = "ppo", "ppo with planning", "look ahead", "straight to goal", "random"
+        assert tuple(rows) == policies
         assert (run / f"trajectories_{difficulty}.png").is_file()
         assert f"**{difficulty}**" in (run / "summary.md").read_text()
     assert sum(rows["ppo"]["tasks"] for rows in summary.values()) == 4

@@ -7,7 +7,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import pytest
-from flax import struct
+from counting import Counter, Counting
 
 from vertiwm_jax import checkpoints, runs, training
 from vertiwm_jax.runs import Run
@@ -19,22 +19,6 @@ from vertiwm_jax.training import (
 )
 
 CONFIG = CheckpointConfig(checkpoint_every=4, keep=2)
-
-
-@struct.dataclass
-class Counter:
-    count: jax.Array
-
-
-class Counting:
-    """The simplest algorithm: it counts from its data; beyond a million it is lost."""
-
-    def init(self, data, key):
-        return Counter(data)
-
-    def iterate(self, data, state):
-        metrics = {"finite": state.count < 1e6, "count": state.count, "never": jnp.nan}
-        return Counter(state.count + 1), metrics
 
 
 @pytest.fixture

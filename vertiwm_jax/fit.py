@@ -22,6 +22,8 @@ class FitConfig(PipelineConfig):
 
     data: tuple[Path, ...] = (Path("data/open"),)
     """Folders of drives, or of such folders named rigid, deformable and mixed."""
+    name: str = "fit"
+    """What the name of the run folder begins with; the date follows."""
     seed: int = 0
     """Decides everything that is random."""
     runs: Path = Path("runs")
@@ -39,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
     try:
         settings = replace(config, resume=None)
-        with _open(config.resume, config.runs, settings) as run:
+        with _open(config.resume, settings) as run:
             print(f"run folder {run.folder}", flush=True)
             params = pipeline.fit(config, config.data, jax.random.key(config.seed), run)
             model.save(run.folder / "model", config.model, params)
@@ -58,8 +60,10 @@ def _configuration(argv: Sequence[str] | None) -> FitConfig:
     return configuration.parse_resumable(FitConfig, "fit_chrono", argv, "python -m vertiwm_jax.fit")
 
 
-def _open(resume: Path | None, runs: Path, settings: FitConfig) -> Run:
-    return Run.open(resume, 0, settings) if resume else Run.create(runs, "fit", settings)
+def _open(resume: Path | None, settings: FitConfig) -> Run:
+    if resume:
+        return Run.open(resume, 0, settings)
+    return Run.create(settings.runs, settings.name, settings)
 
 
 if __name__ == "__main__":

@@ -13,16 +13,17 @@ import numpy as np
 from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
 from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.env.driver import Driver, Policy
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
 from vertiwm_jax.env.observation import ARCS
 from vertiwm_jax.env.repeat import ActionRepeat, Controller
 from vertiwm_jax.evaluation import plots, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
-from vertiwm_jax.evaluation.navigation import Policy
 from vertiwm_jax.evaluation.report import Results, drive
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.learned import Corrected
 from vertiwm_jax.rl.loop import LoopConfig, restore, train
+from vertiwm_jax.rl.planning import Planner, PlanningConfig
 from vertiwm_jax.rl.ppo import PPO, PPOConfig, TrainState
 from vertiwm_jax.rl.task import TaskConfig
 from vertiwm_jax.runs import Run, RunError
@@ -30,7 +31,7 @@ from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.training import TrainingError, TrainingInterrupted
 
-Rows = dict[str, Policy]
+Rows = dict[str, Policy | Driver]
 
 CURVES = {
     "episode_return": "return",
@@ -56,6 +57,8 @@ class TrainConfig(TaskConfig):
     """Steps of 0.1 s that an action is held while learning; ppo.transitions counts actions."""
     base: Literal["look ahead", "straight to goal", "none"] = "look ahead"
     """The controller that the policy learns to correct; it acts at every step."""
+    planning: PlanningConfig | None = None
+    """How the policy plans in tests, besides driving as it is; learning does not need it."""
     ppo: PPOConfig = PPOConfig()
     """The algorithm."""
     loop: LoopConfig = LoopConfig()
@@ -109,9 +112,23 @@ def _base(config: TrainConfig) -> Controller | None:
 def _policies(config: TrainConfig, ppo: PPO, params: NavigationParams, state: TrainState) -> Rows:
     base, rows = _base(config), {}
     for seed in range(config.loop.seeds):
-        learned = ppo.policy(params, jax.tree.map(lambda x, seed=seed: x[seed], state))
-        name = f"ppo, seed {seed}" if config.loop.seeds > 1 else "ppo"
-        rows[name] = Corrected(base, learned) if base else learned
+        of_seed = jax.tree.map(lambda x, seed=seed: x[seed], state)
+        policy, name = ppo.policy(params, of_seed), "ppo"
+        if config.loop.seeds > 1:
+            name = f"ppo, seed {seed}"
+        rows[name] = Corrected(base, policy) if base else policy
+        if config.planning:
+            dynamics, weights = task.dynamics(config, config.planning.model)
+            rows[f"{name} with planning"] = Planner(
+                env=NavigationEnv(dynamics, config.navigation),
+                dynamics=weights,
+                policy=policy,
+                value=ppo.value(of_seed),
+                base=base,
+                interval=config.action_repeat,
+                discount=config.ppo.discount,
+                config=config.planning,
+            )
     return rows
 
 

@@ -5,7 +5,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import pytest
-from flax import struct
+from counting import Counting
 from rl.probes import Broken, ProbeParams, Target
 
 from vertiwm_jax import checkpoints, runs
@@ -17,22 +17,6 @@ from vertiwm_jax.training import TrainingError, TrainingInterrupted
 CONFIG = PPOConfig(
     transitions=6 * 32, num_envs=4, num_steps=8, minibatches=2, epochs=2, hidden=(8,)
 )
-
-
-@struct.dataclass
-class Counter:
-    count: jax.Array
-
-
-class Counting:
-    """The simplest algorithm: it counts, from `env_params`."""
-
-    def init(self, env_params, key):
-        return Counter(env_params)
-
-    def iterate(self, env_params, state):
-        metrics = {"finite": state.count < 1e6, "count": state.count, "never": jnp.nan}
-        return Counter(state.count + 1), metrics
 
 
 @pytest.fixture

@@ -43,7 +43,7 @@ def train(ppo, env_params=ProbeParams(), seed=0, iterations=None):
 
 
 def values(ppo, state, *observations):
-    return np.asarray(ppo.value(state, jnp.array(observations, jnp.float32)[:, None]))
+    return np.asarray(ppo.value(state)(jnp.array(observations, jnp.float32)[:, None]))
 
 
 @pytest.mark.parametrize("normalise", [False, True])

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vertiwm_jax.env.driver import Policy
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, GOAL, arcs_ahead
-from vertiwm_jax.evaluation.navigation import Policy
 from vertiwm_jax.geometry import wrap
 from vertiwm_jax.state import Command
 

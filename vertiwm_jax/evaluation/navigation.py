@@ -4,26 +4,17 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import Protocol, Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vertiwm_jax.env.driver import Driver, Policy, Reactive
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.state import STEP_SECONDS
-
-
-class Policy(Protocol):
-    """`[O]` observation and a key to a `[2]` action in [-1, 1].
-
-    A pytree that can be called: what it has learned are leaves, so that other weights of the
-    same shapes do not compile again.
-    """
-
-    def __call__(self, observation: jax.Array, key: jax.Array) -> jax.Array: ...
 
 
 @struct.dataclass
@@ -67,18 +58,19 @@ class NavigationResult:
 
 
 def evaluate(
-    env: NavigationEnv, params: NavigationParams, policy: Policy, key: jax.Array
+    env: NavigationEnv, params: NavigationParams, policy: Policy | Driver, key: jax.Array
 ) -> NavigationResult:
     """Drives every task of the pool once, all at the same time, as one compiled program.
 
     The program ends when the last episode does.
     """
-    return _evaluate(env, int(params.max_steps_in_episode), params, policy, key)
+    driver = policy if isinstance(policy, Driver) else Reactive(policy)
+    return _evaluate(env, int(params.max_steps_in_episode), params, driver, key)
 
 
 @partial(jax.jit, static_argnames=("env", "length"))
 def _evaluate(
-    env: NavigationEnv, length: int, params: NavigationParams, policy: Policy, key: jax.Array
+    env: NavigationEnv, length: int, params: NavigationParams, driver: Driver, key: jax.Array
 ) -> NavigationResult:
     count = params.pool_size
     observation, start = jax.vmap(env.start, (None, 0))(params, jnp.arange(count))
@@ -91,33 +83,47 @@ def _evaluate(
     )
 
     @jax.vmap
+    def decide(memory: Any, observation: jax.Array, state: NavigationState, key: jax.Array) -> Any:
+        return driver.decide(params, memory, observation, state, key)
+
+    @jax.vmap
     def drive(
-        observation: jax.Array, state: NavigationState, key: jax.Array
-    ) -> tuple[jax.Array, NavigationState]:
+        memory: Any, observation: jax.Array, state: NavigationState, key: jax.Array
+    ) -> tuple[Any, jax.Array, NavigationState]:
         key_policy, key_step = jax.random.split(key)
-        action = policy(observation, key_policy)
+        action, new_memory = driver.act(params, memory, observation, state, key_policy)
         new_observation, new_state, *_ = env.step_env(key_step, state, action, params)
         over = state.ending != Ending.RUNNING
         return jax.tree.map(
             lambda old, new: jnp.where(over, old, new),
-            (observation, state),
-            (new_observation, new_state),
+            (memory, observation, state),
+            (new_memory, new_observation, new_state),
         )
 
     def unfinished(carry: tuple) -> jax.Array:
-        step, _, state, _ = carry
+        step, _, _, state, _ = carry
         return (step < length) & jnp.any(state.ending == Ending.RUNNING)
 
-    def advance(carry: tuple) -> tuple:
-        step, observation, state, paths = carry
+    def advance(carry: tuple, _: None) -> tuple[tuple, None]:
+        step, memory, observation, state, paths = carry
         keys = jax.random.split(jax.random.fold_in(key, step), count)
-        observation, state = drive(observation, state, keys)
+        memory, observation, state = drive(memory, observation, state, keys)
         step = step + 1
         paths = jax.tree.map(lambda path, x: path.at[step].set(x), paths, position_and_rpy(state))
-        return step, observation, state, paths
+        return (step, memory, observation, state, paths), None
 
-    last, _, end, paths = jax.lax.while_loop(
-        unfinished, advance, (jnp.int32(0), observation, start, paths)
+    def go_on(carry: tuple) -> tuple:
+        step, memory, observation, state, paths = carry
+        keys = jax.random.split(jax.random.fold_in(deciding, step), count)
+        memory = decide(memory, observation, state, keys)
+        carry = step, memory, observation, state, paths
+        return jax.lax.scan(advance, carry, length=driver.interval)[0]
+
+    # Steps after the time limit, to fill an interval, change nothing: all episodes are over.
+    deciding = jax.random.fold_in(key, length)
+    memory = jax.vmap(driver.start, (None, 0))(params, start)
+    last, _, _, end, paths = jax.lax.while_loop(
+        unfinished, go_on, (jnp.int32(0), memory, observation, start, paths)
     )
     after = (jnp.arange(length + 1) > last)[:, None, None]
     position, rpy = jax.tree.map(

@@ -7,10 +7,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from vertiwm_jax.env.driver import Driver, Policy
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
 from vertiwm_jax.evaluation.navigation import (
     NavigationResult,
-    Policy,
     Summary,
     evaluate,
     format_table,
@@ -21,7 +21,10 @@ Results = Mapping[str, NavigationResult]
 
 
 def drive(
-    env: NavigationEnv, params: NavigationParams, policies: Mapping[str, Policy], key: jax.Array
+    env: NavigationEnv,
+    params: NavigationParams,
+    policies: Mapping[str, Policy | Driver],
+    key: jax.Array,
 ) -> dict[str, Results]:
     """Drives all tasks of the pool with each policy; the results by difficulty of the ground."""
     print(f"driving {params.pool_size} tasks on {params.terrain.worlds} worlds ...", flush=True)

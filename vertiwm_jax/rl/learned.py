@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.env.repeat import Controller
-from vertiwm_jax.networks.policy import Actor, Gaussian
+from vertiwm_jax.networks.policy import Actor, Critic, Gaussian
 from vertiwm_jax.rl.normalise import RunningStatistics
 
 
@@ -28,6 +28,25 @@ class MeanAction:
         seen = self.observations.normalise(observation)
         policy = cast(Gaussian, self.actor.apply(self.params, seen))
         return jnp.clip(policy.mean, -1.0, 1.0)
+
+
+@struct.dataclass
+class Value:
+    """The return that the learned policy can expect, as far as it was learned.
+
+    critic: the network, static; params: its weights.
+    observations: statistics that its observations are normalised by; scale: `[]` of its output.
+    """
+
+    critic: Critic = struct.field(pytree_node=False)
+    params: Any
+    observations: RunningStatistics
+    scale: jax.Array
+
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """`[..., O]` observations to `[...]` values, in units of reward."""
+        seen = self.observations.normalise(observation)
+        return self.scale * cast(jax.Array, self.critic.apply(self.params, seen))
 
 
 @struct.dataclass

@@ -19,7 +19,7 @@ from gymnax.environments.environment import Environment
 
 from vertiwm_jax.networks.policy import Actor, Candidates, Critic, Gaussian
 from vertiwm_jax.rl.advantages import discounted_returns, generalised_advantages
-from vertiwm_jax.rl.learned import MeanAction
+from vertiwm_jax.rl.learned import MeanAction, Value
 from vertiwm_jax.rl.normalise import RunningStatistics
 
 Params = Any
@@ -245,11 +245,10 @@ class PPO:
         actor, params = self._actor(env_params), state.params["actor"]
         return MeanAction(actor, params, state.observations)
 
-    def value(self, state: TrainState, observation: jax.Array) -> jax.Array:
-        """`[..., O]` observations to `[...]` values, in units of reward."""
-        return state.returns.std * self._value(
-            state.params, state.observations.normalise(observation)
-        )
+    def value(self, state: TrainState) -> Value:
+        """What `state` expects of its policy."""
+        params, scale = state.params["critic"], state.returns.std
+        return Value(self._critic, params, state.observations, scale)
 
     def _actor(self, env_params: Params) -> Actor:
         actions = math.prod(self.env.action_space(env_params).shape)

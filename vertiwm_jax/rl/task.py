@@ -6,6 +6,7 @@ from typing import Literal
 
 import jax
 
+from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv, NavigationParams
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
@@ -74,11 +75,16 @@ def test_environment(config: TaskConfig, terrain: TerrainMap) -> Task:
 
 def environment(config: TaskConfig, model: ModelName, terrain: TerrainMap, tasks: Tasks) -> Task:
     """Tasks inside one of the models."""
-    dynamics, params = config.simulator, chrono_like(hmmwv())
-    if model != "builtin":
-        dynamics, params = choose(model, config.weights)
-    env = NavigationEnv(dynamics, config.navigation)
+    moves, params = dynamics(config, model)
+    env = NavigationEnv(moves, config.navigation)
     return Task(env, env.make_params(params, terrain, tasks))
+
+
+def dynamics(config: TaskConfig, model: ModelName) -> tuple[Dynamics, Params]:
+    """One of the models, and its parameters."""
+    if model == "builtin":
+        return config.simulator, chrono_like(hmmwv())
+    return choose(model, config.weights)
 
 
 def outcomes(info: dict[str, jax.Array]) -> dict[str, jax.Array]:

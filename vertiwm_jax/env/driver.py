@@ -1,0 +1,89 @@
+"""What drives a vehicle through its task: functions of an observation, and those that remember."""
+
+from abc import ABC, abstractmethod
+from typing import Any, Protocol
+
+import jax
+from flax import struct
+
+from vertiwm_jax.env.navigation import NavigationParams, NavigationState
+
+Memory = Any
+
+
+class Policy(Protocol):
+    """`[O]` observation and a key to a `[2]` action in [-1, 1].
+
+    A pytree that can be called: what it has learned are leaves, so that other weights of the
+    same shapes do not compile again.
+    """
+
+    def __call__(self, observation: jax.Array, key: jax.Array) -> jax.Array: ...
+
+
+class Driver(ABC):
+    """Decides every `interval` steps and acts at each, and carries a memory of its own.
+
+    A pytree, like a `Policy`; `interval` is static. It sees the state that the task is in, which
+    its methods get of one episode; the parameters are those of the environment that it drives in.
+    """
+
+    interval: int
+
+    @abstractmethod
+    def start(self, params: NavigationParams, state: NavigationState) -> Memory:
+        """The memory at the beginning of an episode."""
+
+    @abstractmethod
+    def decide(
+        self,
+        params: NavigationParams,
+        memory: Memory,
+        observation: jax.Array,
+        state: NavigationState,
+        key: jax.Array,
+    ) -> Memory:
+        """The memory with what is intended for the next `interval` steps."""
+
+    @abstractmethod
+    def act(
+        self,
+        params: NavigationParams,
+        memory: Memory,
+        observation: jax.Array,
+        state: NavigationState,
+        key: jax.Array,
+    ) -> tuple[jax.Array, Memory]:
+        """A `[2]` action in [-1, 1], and the memory after it."""
+
+
+@struct.dataclass
+class Reactive(Driver):
+    """A policy as a driver: it acts on what it sees, and remembers nothing."""
+
+    policy: Policy
+    interval: int = struct.field(pytree_node=False, default=1)
+
+    def start(self, params: NavigationParams, state: NavigationState) -> None:
+        """Nothing."""
+
+    def decide(
+        self,
+        params: NavigationParams,
+        memory: None,
+        observation: jax.Array,
+        state: NavigationState,
+        key: jax.Array,
+    ) -> None:
+        """Nothing."""
+
+    def act(
+        self,
+        params: NavigationParams,
+        memory: None,
+        observation: jax.Array,
+        state: NavigationState,
+        key: jax.Array,
+    ) -> tuple[jax.Array, None]:
+        """What the policy says."""
+        return self.policy(observation, key), None
