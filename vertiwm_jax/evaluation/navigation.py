@@ -62,7 +62,7 @@ def evaluate(
 ) -> NavigationResult:
     """Drives every task of the pool once, all at the same time, as one compiled program.
 
-    The program ends when the last episode does.
+    Nothing is computed any more once the last episode has ended.
     """
     driver = policy if isinstance(policy, Driver) else Reactive(policy)
     return _evaluate(env, int(params.max_steps_in_episode), params, driver, key)
@@ -100,10 +100,6 @@ def _evaluate(
             (new_memory, new_observation, new_state),
         )
 
-    def unfinished(carry: tuple) -> jax.Array:
-        step, _, _, state, _ = carry
-        return (step < length) & jnp.any(state.ending == Ending.RUNNING)
-
     def advance(carry: tuple, _: None) -> tuple[tuple, None]:
         step, memory, observation, state, paths = carry
         keys = jax.random.split(jax.random.fold_in(key, step), count)
@@ -112,19 +108,24 @@ def _evaluate(
         paths = jax.tree.map(lambda path, x: path.at[step].set(x), paths, position_and_rpy(state))
         return (step, memory, observation, state, paths), None
 
-    def go_on(carry: tuple) -> tuple:
+    def drive_on(carry: tuple) -> tuple:
         step, memory, observation, state, paths = carry
         keys = jax.random.split(jax.random.fold_in(deciding, step), count)
         memory = decide(memory, observation, state, keys)
         carry = step, memory, observation, state, paths
         return jax.lax.scan(advance, carry, length=driver.interval)[0]
 
+    def unless_over(carry: tuple, _: None) -> tuple[tuple, None]:
+        running = jnp.any(carry[3].ending == Ending.RUNNING)
+        return jax.lax.cond(running, drive_on, lambda over: over, carry), None
+
     # Steps after the time limit, to fill an interval, change nothing: all episodes are over.
     deciding = jax.random.fold_in(key, length)
     memory = jax.vmap(driver.start, (None, 0))(params, start)
-    last, _, _, end, paths = jax.lax.while_loop(
-        unfinished, go_on, (jnp.int32(0), memory, observation, start, paths)
-    )
+    carry = jnp.int32(0), memory, observation, start, paths
+    # Not a `while_loop`: on CPUs XLA runs what is inside one several times slower.
+    decisions = -(-length // driver.interval)
+    (last, _, _, end, paths), _ = jax.lax.scan(unless_over, carry, length=decisions)
     after = (jnp.arange(length + 1) > last)[:, None, None]
     position, rpy = jax.tree.map(
         lambda path, x: jnp.where(after, x, path), paths, position_and_rpy(end)
