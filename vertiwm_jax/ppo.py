@@ -184,7 +184,10 @@ def _draw(
     plots.save(figure, run.folder / "learning_curves.png")
     for name, results in groups.items():
         reference = results[REFERENCE]
-        hard = int(np.argmin(reference.success))  # the first failure, if there is one
+        # The first task that the reference fails, better still one that a learned policy solves.
+        failed = ~np.asarray(reference.success)
+        solved = np.asarray(next(iter(results.values())).success)
+        hard = int(np.argmax(2 * failed + solved))
         figure = plots.trajectories(
             test.terrain,
             int(reference.world[hard]),

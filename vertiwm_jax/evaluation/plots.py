@@ -71,7 +71,7 @@ def trajectories(
         pitch.set_ylabel("pitch [deg], nose down")
         pitch.set_xlabel("time [s]")
         roll.tick_params(labelbottom=False)
-        figure.legend(*overhead.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+        figure.legend(*overhead.get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return figure
 
 
