@@ -21,7 +21,6 @@ from vertiwm_jax.world_model.choice import choose
 RECORDED = Path(__file__).parent / "data" / "chrono_drives"
 STAGES = (
     "nesam_autoencoders", "nesam_soil", "nesam_single_steps", "nesam_rollouts",
-    "nesam_refinement",
     "transformer_autoencoders", "transformer_single_steps", "transformer_rollouts", "gate",
 )  # fmt: skip
 SHORT = "{updates: 2, updates_per_iteration: 1, warm_up: 0}"
@@ -29,9 +28,7 @@ TINY = f"""
 windows: {{batch: 2, context: 2, horizon: 3, validation: 2}}
 patches: {{batch: 2, validation: 2}}
 transformer: {{autoencoders: {SHORT}, single_steps: {SHORT}, rollouts: {SHORT}}}
-nesam:
-  {{autoencoders: {SHORT}, single_steps: {SHORT}, rollouts: {SHORT},
-   refinement: {{updates: 2, updates_per_iteration: 1, warm_up: 0, trainable: [network]}}}}
+nesam: {{autoencoders: {SHORT}, single_steps: {SHORT}, rollouts: {SHORT}}}
 soil: {SHORT}
 gate: {{learns_from: [deformable], rollouts: {SHORT}}}
 """

@@ -7,7 +7,7 @@ import pytest
 
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.touch import LEAST_SINKAGE, Touch, touch
+from vertiwm_jax.mechanics.touch import LEAST_YIELD, Touch, touch
 from vertiwm_jax.mechanics.vector import Axes, Vector
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.state import Command, VehicleState
@@ -89,7 +89,7 @@ def test_rigid_ground_under_one_rim_carries_the_wheel():
 
 def test_what_carries_a_wheel_on_soil_is_soil():
     """Rigid ground higher up on its rim than it has sunk does not count."""
-    found = wheels(halves(MUD, CONCRETE), x=-0.2, depth=LEAST_SINKAGE, sinkage=LEAST_SINKAGE)
+    found = wheels(halves(MUD, CONCRETE), x=-0.2, depth=LEAST_YIELD, sinkage=LEAST_YIELD)
     assert found.soft[0]
     assert found.friction[0] == 0
     assert found.soil.kphi[0] == halves(MUD, MUD).soils.kphi[MUD]

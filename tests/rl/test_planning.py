@@ -14,6 +14,7 @@ from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.evaluation.controllers import StraightToGoal
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.rl.learned import Corrected
 from vertiwm_jax.rl.planning import Planner, PlanningConfig
 
 CONFIG = NavigationConfig(horizon_seconds=15.0)
@@ -28,17 +29,6 @@ class Always:
 
     def __call__(self, observation, key=None):
         return self.answer
-
-
-@struct.dataclass
-class Held:
-    """What a planner does that compares nothing."""
-
-    base: StraightToGoal
-    correction: jax.Array
-
-    def __call__(self, observation, key):
-        return jnp.clip(self.base(observation, key) + self.correction, -1, 1)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +56,7 @@ def test_without_alternatives_it_drives_as_the_policy_does(blocked):
     for correction in ((0.0, 0.0), (0.1, 0.2)):
         alone = planner(env, correction, candidates=1, decisions=1)
         found = navigation.evaluate(env, params, alone, KEY)
-        held = Held(StraightToGoal(CONFIG), jnp.array(correction))
+        held = Corrected(StraightToGoal(CONFIG), Always(jnp.array(correction)))
         expected = navigation.evaluate(env, params, held, KEY)
         assert int(found.ending[0]) == int(expected.ending[0])
         np.testing.assert_allclose(found.path(0)[0], expected.path(0)[0], atol=1e-3)

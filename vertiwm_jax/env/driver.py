@@ -28,13 +28,12 @@ class Driver(ABC):
     its methods get of one episode; the parameters are those of the environment that it drives in.
     """
 
-    interval: int
+    interval = 1
 
-    @abstractmethod
     def start(self, params: NavigationParams, state: NavigationState) -> Memory:
-        """The memory at the beginning of an episode."""
+        """The memory at the beginning of an episode; none, by default."""
+        return None
 
-    @abstractmethod
     def decide(
         self,
         params: NavigationParams,
@@ -43,7 +42,8 @@ class Driver(ABC):
         state: NavigationState,
         key: jax.Array,
     ) -> Memory:
-        """The memory with what is intended for the next `interval` steps."""
+        """The memory with what is intended for the next `interval` steps; by default as it is."""
+        return memory
 
     @abstractmethod
     def act(
@@ -62,20 +62,6 @@ class Reactive(Driver):
     """A policy as a driver: it acts on what it sees, and remembers nothing."""
 
     policy: Policy
-    interval: int = struct.field(pytree_node=False, default=1)
-
-    def start(self, params: NavigationParams, state: NavigationState) -> None:
-        """Nothing."""
-
-    def decide(
-        self,
-        params: NavigationParams,
-        memory: None,
-        observation: jax.Array,
-        state: NavigationState,
-        key: jax.Array,
-    ) -> None:
-        """Nothing."""
 
     def act(
         self,

@@ -13,6 +13,15 @@ Controller = Callable[[jax.Array, Any], jax.Array]
 """`(observation [..., O], key)` to actions `[..., A]` in [-1, 1]."""
 
 
+def corrected(
+    base: Controller | None, observation: jax.Array, key: Any, correction: jax.Array
+) -> jax.Array:
+    """What a controller does, `[..., A]`, with a correction; without one, the correction itself."""
+    if base is None:
+        return correction
+    return jnp.clip(base(observation, key) + correction, -1.0, 1.0)
+
+
 @dataclass(frozen=True)
 class ActionRepeat(Environment):
     """Holds every action for `times` steps of `env`, or until the episode ends.
@@ -38,10 +47,8 @@ class ActionRepeat(Environment):
         keys = jax.random.split(key, self.times)
 
         def once(observation: jax.Array, state: Any, key: jax.Array) -> tuple:
-            if self.base is None:
-                return self.env.step_env(key, state, action, params)
-            corrected = jnp.clip(self.base(observation, key) + action, -1.0, 1.0)
-            return self.env.step_env(key, state, corrected, params)
+            acted = corrected(self.base, observation, key, jnp.asarray(action))
+            return self.env.step_env(key, state, acted, params)
 
         first = once(self.env.observe(key, state, None, params), state, keys[0])
 

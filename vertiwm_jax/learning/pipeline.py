@@ -54,8 +54,6 @@ class SpecialistConfig:
     """From recorded states, all of a window at once: a cheap beginning."""
     rollouts: FitConfig = FitConfig(updates=10_000, trainable=("network",))
     """Open loop, as it will be used."""
-    refinement: FitConfig | None = None
-    """More of the same, with a schedule of its own (a warm restart)."""
 
 
 @dataclass(frozen=True)
@@ -149,11 +147,9 @@ class _Stages:
         for part, objective, schedule in (
             ("single_steps", single, config.single_steps),
             ("rollouts", rollouts, config.rollouts),
-            ("refinement", rollouts, config.refinement),
         ):
-            if schedule:
-                problem = WindowProblem(specialist, objective, self.config.windows)
-                params = self._fit(f"{name}_{part}", problem, schedule, params, data)
+            problem = WindowProblem(specialist, objective, self.config.windows)
+            params = self._fit(f"{name}_{part}", problem, schedule, params, data)
         return params
 
     def gate(self, verti_wm: VertiWM, params: VertiWMParams) -> VertiWMParams:

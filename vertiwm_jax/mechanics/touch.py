@@ -16,8 +16,8 @@ TREAD_ANGLES = (-0.7, -0.35, 0.0, 0.35, 0.7)
 """Where both rims of a wheel are tested against the ground, rad from straight down."""
 SHARED_DEPTH = 0.005
 """Depth, m, over which neighbouring points of a tread share a contact."""
-LEAST_SINKAGE = 0.01
-"""Depth, m, without which soil carries nothing where there is rigid ground beside it."""
+LEAST_YIELD = 0.01
+"""Depth, m, by which soil gives way at least before it carries beside rigid ground."""
 
 _RIM_ANGLES = np.repeat(np.asarray(TREAD_ANGLES, np.float32), 2)[:, None]
 
@@ -106,7 +106,7 @@ def _wheel_contacts(
     what has sunk into it, so rigid ground beside it is a step, whose edge pushes towards the axle.
     """
     soft = terrain.deformable[tread.semantic]
-    carried = tread.depth - jnp.where(soft, jnp.maximum(sinkage, LEAST_SINKAGE), 0.0)
+    carried = tread.depth - jnp.where(soft, jnp.maximum(sinkage, LEAST_YIELD), 0.0)
     share = jax.nn.softmax(carried / SHARED_DEPTH, axis=0)
     in_soil = jnp.sum(share * soft, axis=0) > 0.5
     share = share * (soft == in_soil)
@@ -117,9 +117,11 @@ def _wheel_contacts(
 
     lowest = len(TREAD_ANGLES) - 1, len(TREAD_ANGLES)
     edge = ~in_soil & soft[lowest[0]] & soft[lowest[1]]
+    # Along its own normal, the wheel is as much less deep in it as that is tilted.
     ahead, up = shared(np.sin(_RIM_ANGLES)), shared(np.cos(_RIM_ANGLES))
     to_axle = Vector(-ahead * jnp.cos(steering), -ahead * jnp.sin(steering), up).normalised()
     upright = Vector(*map(shared, tread.normal)).normalised()
+    # Of two soils that carry alike, that under the left rim.
     below = jnp.take_along_axis(tread.semantic, jnp.argmax(share, axis=0)[None], axis=0)[0]
     return Touch(
         point=Vector(*map(shared, tread.point)),

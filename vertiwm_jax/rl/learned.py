@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.env.repeat import Controller
+from vertiwm_jax.env.repeat import Controller, corrected
 from vertiwm_jax.networks.policy import Actor, Critic, Gaussian
 from vertiwm_jax.rl.normalise import RunningStatistics
 
@@ -58,5 +58,4 @@ class Corrected:
 
     def __call__(self, observation: jax.Array, key: jax.Array) -> jax.Array:
         """`[..., O]` observations to `[..., A]` actions in [-1, 1]."""
-        action = self.base(observation, key) + self.correction(observation)
-        return jnp.clip(action, -1.0, 1.0)
+        return corrected(self.base, observation, key, self.correction(observation))

@@ -10,7 +10,7 @@ from flax import struct
 from vertiwm_jax.dynamics import History, Params
 from vertiwm_jax.env.driver import Driver
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
-from vertiwm_jax.env.repeat import ActionRepeat, Controller
+from vertiwm_jax.env.repeat import ActionRepeat, Controller, corrected
 from vertiwm_jax.rl.learned import MeanAction, Value
 from vertiwm_jax.world_model.choice import ModelName
 
@@ -105,9 +105,7 @@ class Planner(Driver):
         key: jax.Array,
     ) -> tuple[jax.Array, Plan]:
         """The base, corrected as planned; the model's history follows the vehicle."""
-        action = memory.correction
-        if self.base:
-            action = jnp.clip(self.base(observation, key) + action, -1.0, 1.0)
+        action = corrected(self.base, observation, key, memory.correction)
         terrain, command = params.terrain.select(state.world), self.env.config.command(action)
         _, history = self.env.dynamics.step(
             self.dynamics, terrain, memory.history, state.vehicle, command
