@@ -229,7 +229,8 @@ def test_predictions_of_drives(tmp_path, capsys):
     assert float(rows[0]["mean"]) < 0.1 and float(rows[2]["mean"]) < 1e-4
     text = (out / "prediction.md").read_text()
     assert "4-step yaw error, deg" in text and "ground under the vehicle" in text
-    assert (out / "prediction.png").stat().st_size > 10_000
+    for picture in ("prediction.png", "paths.png"):
+        assert (out / picture).stat().st_size > 10_000
 
 
 def test_bad_drives_are_named(tmp_path, capsys):

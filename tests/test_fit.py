@@ -111,16 +111,32 @@ def test_stages_that_have_ended_are_not_repeated(run, fitted, capsys):
         assert (run / stage / "fitted").stat().st_mtime_ns == times[stage], stage
 
 
+def test_another_gate_for_the_specialists_of_an_earlier_run(run, fitted, capsys):
+    capsys.readouterr()
+    other = fitted("--model.coefficients", "scalar", "--reuse", str(run))
+    assert other != run
+    printed = capsys.readouterr().out
+    for stage in STAGES[:-1]:
+        assert f"{stage}: from {run}" in printed
+    assert "gate: from" not in printed
+    config, params = model.load(other / "model")
+    assert config.coefficients == "scalar"
+    chex.assert_trees_all_equal(params.nesam, model.load(run / "model")[1].nesam)
+    assert (other / "learning_curves.png").stat().st_size > 10_000
+
+
 def test_one_specialist_alone_is_fitted_and_compared(fitted, folder, tmp_path, capsys):
     parts = ["--model.parts", "transformer", "--model.terrain"]
-    run = fitted(*parts, "none")
+    run = fitted(*parts, "none", "--name", "no_terrain")
     stages = {path.name for path in run.iterdir() if path.is_dir()}
     assert stages == {"transformer_single_steps", "transformer_rollouts", "model"}
     capsys.readouterr()
     command = ["prediction", "--data", str(folder / "drives" / "deformable")]
     command += ["--context", "2", "--horizon", "3", "--stride", "50", "--models", "builtin"]
-    evaluate.main([*command, "--compare", str(run / "model")])
-    assert f"| {run / 'model'}: transformer | " in capsys.readouterr().out
+    evaluate.main([*command, "--compare", str(run)])
+    printed = capsys.readouterr().out
+    assert "| no_terrain: transformer | " in printed
+    assert "the paper, 16 steps: deformable" in printed and "| 0.790 |" in printed
     with pytest.raises(CheckpointError, match="expected vertiwm, found transformer alone"):
         choose("vertiwm", run / "model")
 

@@ -1,13 +1,11 @@
 """`python -m vertiwm_jax.evaluate`: how well a model predicts, and how well a policy drives."""
 
-import csv
-import io
 import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
 import tyro
 
@@ -16,16 +14,16 @@ from vertiwm_jax import ppo, runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.evaluation import error_sources, plots, prediction, report
+from vertiwm_jax.evaluation import prediction, prediction_report, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
-from vertiwm_jax.evaluation.prediction import MEASURES, PredictionErrors, TestWindows
+from vertiwm_jax.evaluation.prediction import TestWindows
+from vertiwm_jax.fit import FitConfig
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.ppo import TrainConfig
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.runs import RunError
-from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.worlds import Difficulty
 from vertiwm_jax.world_model.choice import ModelName, choose, fitted
 
@@ -41,7 +39,7 @@ class Prediction:
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
     compare: tuple[Path, ...] = ()
-    """Folders of other fitted models, of which each part is a row."""
+    """Run folders of `fit`, of which each part is a row, beside the paper's figures for it."""
     split: dataset.Split = "test"
     """Which of the drives."""
     context: int = 16
@@ -51,7 +49,7 @@ class Prediction:
     stride: int = 16
     """Steps from one window to the next."""
     output: Path | None = None
-    """Folder for tables and pictures."""
+    """Folder for tables and pictures, also of where and how the first model errs."""
 
     def __post_init__(self):
         if not self.models:
@@ -108,44 +106,25 @@ def _predict(command: Prediction) -> None:
         sys.exit(f"error: {error}")
     models: dict[str, tuple[Dynamics, Params]] = {
         **{name: choose(name, command.weights) for name in command.models},
-        **{
-            f"{folder}: {name}": chosen
-            for folder in command.compare
-            for name, chosen in fitted(folder).items()
-        },
+        **_compared(command.compare),
         "kinematic bicycle": (KinematicBicycle(), bicycle_of(hmmwv())),
         "constant velocity": (ConstantVelocity(), None),
     }
     rows = [prediction.evaluate(name, *models[name], test) for name in models]
     print(f"\n{prediction.format_table(rows, 'position', command.horizon)}", flush=True)
     if command.output:
-        _write_tables(command, rows, test, *models[command.models[0]])
+        shown = {name: models[name] for name in command.models}
+        prediction_report.write(command.output, rows, test, shown)
 
 
-def _write_tables(
-    command: Prediction,
-    rows: list[PredictionErrors],
-    test: TestWindows,
-    best: Dynamics,
-    params: Params,
-) -> None:
-    """All measures as Markdown and CSV, error over time, and where the first model's error is."""
-    folder = cast(Path, command.output)
-    folder.mkdir(parents=True, exist_ok=True)
-    tables = [prediction.format_table(rows, name, command.horizon) for name in MEASURES]
-    errors, _ = prediction.absolute_errors(best, params, test)
-    shares = error_sources.locate(test, errors["position"][:, -1])
-    tables.append(f"Position error of {rows[0].name}, where it is\n")
-    tables.append(error_sources.format_shares(shares))
-    runs.write_atomic(folder / "prediction.md", "\n\n".join(tables) + "\n")
-    lines = prediction.csv_lines(rows)
-    table = io.StringIO()
-    writer = csv.DictWriter(table, list(lines[0]))
-    writer.writeheader()
-    writer.writerows(lines)
-    runs.write_atomic(folder / "prediction.csv", table.getvalue())
-    figure = plots.error_growth({row.name: row.growth for row in rows}, STEP_SECONDS)
-    plots.save(figure, folder / "prediction.png")
+def _compared(folders: Sequence[Path]) -> dict[str, tuple[Dynamics, Params]]:
+    """Every model that was fitted in these runs; a name that two of them have gets the folder's."""
+    names = [configuration.load(FitConfig, folder / "config.yaml").name for folder in folders]
+    return {
+        f"{name if names.count(name) == 1 else folder.name}: {part}": model
+        for name, folder in zip(names, folders, strict=True)
+        for part, model in fitted(folder / "model").items()
+    }
 
 
 def _navigate(command: Navigation) -> None:

@@ -8,12 +8,23 @@ from pathlib import Path
 import jax
 
 from vertiwm_jax import config as configuration
+from vertiwm_jax import runs
 from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.evaluation import plots
 from vertiwm_jax.learning import pipeline
 from vertiwm_jax.learning.pipeline import PipelineConfig
 from vertiwm_jax.runs import Run, RunError
 from vertiwm_jax.training import TrainingError, TrainingInterrupted
 from vertiwm_jax.world_model import model
+
+ROLLOUTS = ("nesam_rollouts", "transformer_rollouts", "gate")
+"""Stages that are drawn."""
+CURVES = {
+    "loss": "loss",
+    "error_rigid": "error on rigid ground [m]",
+    "error_deformable": "error on soil [m]",
+    "error_transition": "error across borders [m]",
+}
 
 
 @dataclass(frozen=True)
@@ -30,6 +41,8 @@ class FitConfig(PipelineConfig):
     """Folder in which the folder of this run is made."""
     resume: Path | None = None
     """Folder of an earlier run to go on with; stages that have ended are not repeated."""
+    reuse: tuple[Path, ...] = ()
+    """Folders of earlier runs, whose stages are taken over where their inputs are the same."""
     compile_cache: Path | None = None
     """Folder that keeps compiled programs for later runs."""
 
@@ -43,8 +56,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         settings = replace(config, resume=None)
         with _open(config.resume, settings) as run:
             print(f"run folder {run.folder}", flush=True)
-            params = pipeline.fit(config, config.data, jax.random.key(config.seed), run)
+            params = pipeline.fit(
+                config, config.data, jax.random.key(config.seed), run, config.reuse
+            )
             model.save(run.folder / "model", config.model, params)
+            _draw(run)
     except TrainingInterrupted as stopped:
         print(stopped)
         sys.exit(130)
@@ -53,7 +69,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(130)
     except (RunError, CheckpointError, TrainingError, ValueError) as error:
         sys.exit(f"error: {error}")
-    print(f"the model is in {run.folder / 'model'}")
+    print(f"the model is in {run.folder / 'model'}; how well it predicts:")
+    print(f"python -m vertiwm_jax.evaluate prediction --compare {run.folder} --data DRIVES")
 
 
 def _configuration(argv: Sequence[str] | None) -> FitConfig:
@@ -64,6 +81,14 @@ def _open(resume: Path | None, settings: FitConfig) -> Run:
     if resume:
         return Run.open(resume, 0, settings)
     return Run.create(settings.runs, settings.name, settings)
+
+
+def _draw(run: Run) -> None:
+    """Losses and errors on validation drives of the stages that learn from rollouts."""
+    stages = [name for name in ROLLOUTS if (run.folder / name).is_dir()]
+    curves = {name: runs.read_columns(run.folder / name) for name in stages}
+    figure = plots.learning_curves(curves, "updates", CURVES, "updates")
+    plots.save(figure, run.folder / "learning_curves.png")
 
 
 if __name__ == "__main__":

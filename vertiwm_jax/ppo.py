@@ -176,9 +176,7 @@ def _draw(
     run: Run, config: TrainConfig, test: NavigationParams, groups: Mapping[str, Results]
 ) -> None:
     """Learning curves, and for each difficulty a drive to a goal that is hard to reach."""
-    metrics = runs.read_metrics(run.folder)
-    names = dict.fromkeys(name for line in metrics for name in line)
-    columns = {name: [line.get(name, np.nan) for line in metrics] for name in names}
+    columns = runs.read_columns(run.folder)
     labels = {name: label for name, label in CURVES.items() if name in columns}
     figure = plots.learning_curves({"ppo": columns}, "transitions", labels, "transitions")
     plots.save(figure, run.folder / "learning_curves.png")

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import time
 from collections.abc import Mapping
@@ -213,6 +214,13 @@ def read_metrics(folder: str | Path) -> list[dict[str, float]]:
             raise RunError(f"{path}: line {number}: {expected}, found {line[:60]!r}") from error
         entries.append(entry)
     return entries
+
+
+def read_columns(folder: str | Path) -> dict[str, list[float]]:
+    """`read_metrics` by name, NaN where a line has no such number."""
+    lines = read_metrics(folder)
+    names = dict.fromkeys(name for line in lines for name in line)
+    return {name: [line.get(name, math.nan) for line in lines] for name in names}
 
 
 def write_atomic(path: str | Path, data: bytes | str) -> None:

@@ -50,4 +50,7 @@ def test_learning_curves_draw_every_metric_of_every_run():
     figure = plots.learning_curves(runs, "step", labels, "transitions")
     assert [axes.get_ylabel() for axes in figure.axes] == ["success rate", "value loss"]
     np.testing.assert_array_equal(figure.axes[0].lines[2].get_ydata(), 2 * np.arange(5))
+    del runs["seed 1"]["loss"]
+    figure = plots.learning_curves(runs, "step", labels, "transitions")
+    assert np.isnan(figure.axes[1].lines[1].get_ydata()).all()
     figure.savefig(io.BytesIO())

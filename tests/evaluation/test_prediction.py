@@ -149,6 +149,10 @@ def test_tables():
     assert lines[4].startswith("| still | 1.800 (")
     assert lines[4].endswith(" | 5 |")
     assert lines[5] == "| constant velocity | 0.000 (0.000-0.000) | 0 |"
+    lines = prediction.format_table([*rows, replace(rows[0], name="mixed: nesam")], "position", 6)
+    assert lines.splitlines()[2].endswith("| diverged | the paper, 16 steps: rigid |")
+    assert lines.splitlines()[5].endswith("| 0 |  |")
+    assert lines.splitlines()[6].endswith("| 5 | 0.563 |")
     table = prediction.csv_lines(rows)
     assert len(table) == 2 * len(prediction.MEASURES)
     assert table[0]["model"] == "still" and table[0]["mean"] == pytest.approx(1.8, rel=1e-4)

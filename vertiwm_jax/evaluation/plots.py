@@ -48,8 +48,8 @@ def trajectories(
     drives: by name, positions `[T, 3]` m and roll, pitch, yaw `[T, 3]` rad, all to the one goal
     `[2 or 3]`. The caller saves and owns the figure; no window is opened.
     """
-    with _style():
-        figure = _figure(9.0, 4.6)
+    with style():
+        figure = sheet(9.0, 4.6)
         grid = figure.add_gridspec(2, 2, width_ratios=(1.1, 1))
         overhead = figure.add_subplot(grid[:, 0])
         roll = figure.add_subplot(grid[0, 1])
@@ -58,7 +58,7 @@ def trajectories(
         overhead.add_patch(_circle(goal, goal_radius))
         overhead.plot(goal[0], goal[1], "*", color="black", markersize=9, markeredgecolor="white")
         for i, (name, (position, rpy)) in enumerate(drives.items()):
-            colour, dash = _line(i)
+            colour, dash = line(i)
             x, y = position[:, 0], position[:, 1]
             overhead.plot(x, y, color="white", linewidth=3.2, alpha=0.8)
             overhead.plot(x, y, dash, label=name, linewidth=1.8, color=colour)
@@ -84,17 +84,18 @@ def learning_curves(
     """One panel for each of `labels`, metric name to axis label, one line for each run.
 
     metrics: by run, columns of numbers of equal length by metric name. `x` names the column of
-    the horizontal axis. Gaps (NaN) are left open.
+    the horizontal axis. Gaps (NaN) are left open; a run may lack metrics.
     """
-    with _style():
+    with style():
         columns = math.ceil(math.sqrt(len(labels)))
         rows = math.ceil(len(labels) / columns)
-        figure = _figure(3.2 * columns, 2.5 * rows + 0.3)
+        figure = sheet(3.2 * columns, 2.5 * rows + 0.3)
         panels = figure.subplots(rows, columns, squeeze=False, sharex=True)
         for axes, (metric, label) in zip(panels.flat, labels.items(), strict=False):
             for i, (run, table) in enumerate(metrics.items()):
-                colour, dash = _line(i)
-                axes.plot(table[x], table[metric], dash, label=run, color=colour)
+                colour, dash = line(i)
+                values = table.get(metric, [math.nan] * len(table[x]))
+                axes.plot(table[x], values, dash, label=run, color=colour)
             axes.set_ylabel(label)
         for axes in panels.flat[len(labels) :]:
             axes.set_axis_off()
@@ -107,38 +108,16 @@ def learning_curves(
     return figure
 
 
-def error_growth(
-    growth: Mapping[str, Mapping[str, Sequence[float]]], step_seconds: float
-) -> Figure:
-    """Position error over the time predicted, a panel for each kind of ground.
-
-    growth: by model and then by kind, m after each step.
-    """
-    kinds = list(next(iter(growth.values())))
-    with _style():
-        figure = _figure(3.2 * len(kinds), 2.8)
-        panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
-        for axes, kind in zip(panels, kinds, strict=True):
-            for i, (name, by_kind) in enumerate(growth.items()):
-                colour, dash = _line(i)
-                seconds = step_seconds * (1 + np.arange(len(by_kind[kind])))
-                axes.plot(seconds, by_kind[kind], dash, label=name, color=colour)
-            axes.set(title=kind, xlabel="time [s]", xlim=(0, None), yscale="log")
-        panels[0].set_ylabel("position error [m]")
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
-    return figure
-
-
 def save(figure: Figure, path: str | Path) -> None:
     """Write a figure as a whole or not at all, in the format of the ending; else `RunError`."""
     image = io.BytesIO()
-    with _style():
+    with style():
         figure.savefig(image, format=Path(path).suffix[1:])
     runs.write_atomic(path, image.getvalue())
 
 
-def _line(i: int) -> tuple[str, str]:
-    """Colour and dash of the i-th line."""
+def line(i: int) -> tuple[str, str]:
+    """Colour and dash of the i-th line of a picture."""
     return _COLOURS[i % len(_COLOURS)], _DASHES[i % len(_DASHES)]
 
 
@@ -156,13 +135,15 @@ def _circle(centre: np.ndarray, radius: float):
 
 
 # Imported when the first picture is drawn: training should not wait for matplotlib.
-def _style():
+def style():
+    """A context in which a picture is drawn."""
     import matplotlib
 
     return matplotlib.rc_context(_STYLE)
 
 
-def _figure(width: float, height: float) -> Figure:
+def sheet(width: float, height: float) -> Figure:
+    """An empty figure of that many inches."""
     from matplotlib.figure import Figure
 
     # Not made by pyplot: belongs to no window and is freed with its last reference.

@@ -10,6 +10,7 @@ import numpy as np
 
 from vertiwm_jax import geometry
 from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.evaluation.published import POSITION_ERRORS
 from vertiwm_jax.learning import windows as recorded
 from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.learning.rollouts import open_loop
@@ -137,19 +138,25 @@ def evaluate(name: str, dynamics: Dynamics, params: Params, test: TestWindows) -
 
 
 def format_table(rows: Sequence[PredictionErrors], measure: str, horizon: int) -> str:
-    """A Markdown table of one measure, one model a row."""
+    """A Markdown table of one measure, one model a row; the paper's figures where it has them."""
     kinds = list(rows[0].count)
-    counts = [f"{kind} (n = {rows[0].count[kind]})" for kind in kinds]
+    published = [_published(row, measure) for row in rows]
+    heads = ["model", *(f"{kind} (n = {rows[0].count[kind]})" for kind in kinds), "diverged"]
+    heads += [f"the paper, 16 steps: {' / '.join(kinds)}"] if any(published) else []
     lines = [
         f"{horizon}-step {measure} error, {MEASURES[measure]}: mean and 95 % interval over drives",
         "",
-        "| model | " + " | ".join(counts) + " | diverged |",
-        "|" + "---|" * (len(kinds) + 2),
+        f"| {' | '.join(heads)} |",
+        "|" + "---|" * len(heads),
     ]
-    for row in rows:
+    for row, paper in zip(rows, published, strict=True):
         found = [row.final[measure][kind] for kind in kinds]
-        cells = [f"{x.mean:.3f} ({x.low:.3f}-{x.high:.3f})" for x in found]
-        lines.append(f"| {row.name} | " + " | ".join(cells) + f" | {row.diverged} |")
+        cells = [row.name, *(f"{x.mean:.3f} ({x.low:.3f}-{x.high:.3f})" for x in found)]
+        cells.append(str(row.diverged))
+        if any(published):
+            figures = [f"{paper[kind]:.3f}" if kind in paper else "-" for kind in kinds]
+            cells.append(" / ".join(figures) if paper else "")
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -165,11 +172,16 @@ def csv_lines(rows: Sequence[PredictionErrors]) -> list[Mapping[str, str | float
             "mean": x.mean,
             "low": x.low,
             "high": x.high,
+            "paper": _published(row, measure).get(kind, ""),
         }
         for row in rows
         for measure, by_kind in row.final.items()
         for kind, x in by_kind.items()
     ]
+
+
+def _published(row: PredictionErrors, measure: str) -> dict[str, float]:
+    return POSITION_ERRORS.get(row.name, {}) if measure == "position" else {}
 
 
 def _bootstrap(values: np.ndarray, groups: np.ndarray, draws: int = 1000) -> Interval:

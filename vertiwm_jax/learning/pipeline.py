@@ -1,7 +1,6 @@
 """The whole of Verti-WM from recorded drives: what is fitted, in which order, to which drives.
 
-Every stage is a `fitting.fit` in a folder of its own inside that of the run. One that has ended is
-not repeated, and one that was stopped goes on from its newest checkpoint.
+Every stage is a `stages.fit` in a folder of its own inside that of the run.
 """
 
 import operator
@@ -15,9 +14,8 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from vertiwm_jax import checkpoints
 from vertiwm_jax.dynamics import Params
-from vertiwm_jax.learning import autoencoders, dataset, fitting, normalisation, windows
+from vertiwm_jax.learning import autoencoders, dataset, normalisation, stages, windows
 from vertiwm_jax.learning.autoencoders import AutoencoderConfig, AutoencoderProblem, PatchData
 from vertiwm_jax.learning.dataset import Auxiliary, Drives, Split
 from vertiwm_jax.learning.fitting import FitConfig, Problem
@@ -25,6 +23,7 @@ from vertiwm_jax.learning.losses import LossConfig
 from vertiwm_jax.learning.rollouts import OneStep, OpenLoop, WindowConfig, WindowData, WindowProblem
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.learning.soils import SoilProblem
+from vertiwm_jax.learning.stages import Inputs
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.runs import Run
@@ -88,34 +87,46 @@ class PipelineConfig:
     """What fuses the two."""
 
 
-def fit(config: PipelineConfig, folders: Sequence[Path], key: jax.Array, run: Run) -> VertiWMParams:
+def fit(
+    config: PipelineConfig,
+    folders: Sequence[Path],
+    key: jax.Array,
+    run: Run,
+    reuse: Sequence[Path] = (),
+) -> VertiWMParams:
     """All stages of the configured parts; gives their parameters, and others untrained.
 
-    folders: of drives, or of folders of drives named like `KINDS`. Raises what `dataset.load`,
+    folders: of drives, or of folders of drives named like `KINDS`; reuse: of other runs, whose
+    stages are taken over where their inputs are the same. Raises what `dataset.load`,
     `WindowData.of` and `fitting.fit` raise.
     """
-    stages = _Stages(config, tuple(folders), key, run)
+    pipeline = _Pipeline(config, tuple(folders), key, run, tuple(reuse))
+    digests: list[str] = []
     built, parts = config.model, config.model.parts
-    constants = normalisation.measure(stages.load(KINDS, "train")[0])
+    constants = normalisation.measure(pipeline.load(KINDS, "train")[0])
     params = built.init_params(key, chrono_like(hmmwv()), constants)
     if "nesam" in parts:
-        second = stages.specialist("nesam", built.nesam, params.nesam, config.nesam)
+        second, digest = pipeline.specialist("nesam", built.nesam, params.nesam, config.nesam)
         params = replace(params, nesam=second)
+        digests.append(digest)
     if "transformer" in parts:
         settings = config.transformer
-        first = stages.specialist("transformer", built.transformer, params.transformer, settings)
+        specialist, untrained = built.transformer, params.transformer
+        first, digest = pipeline.specialist("transformer", specialist, untrained, settings)
         params = replace(params, transformer=first)
-    return stages.gate(built.build(), params) if "gate" in parts else params
+        digests.append(digest)
+    return pipeline.gate(built.build(), params, digests) if "gate" in parts else params
 
 
 @dataclass(frozen=True)
-class _Stages:
-    """What the stages of one pipeline share."""
+class _Pipeline:
+    """What its stages share."""
 
     config: PipelineConfig
     folders: tuple[Path, ...]
     key: jax.Array
     run: Run
+    reuse: tuple[Path, ...]
 
     def specialist(
         self,
@@ -123,20 +134,25 @@ class _Stages:
         specialist: TransformerSpecialist | Nesam,
         params: Any,
         config: SpecialistConfig,
-    ) -> Any:
-        """Its encoders, then for NeSAM what soils look like, then how it moves."""
-        drives = self._drives(config.learns_from)
+    ) -> tuple[Any, str]:
+        """Its encoders, then for NeSAM what soils look like, then how it moves; and the digest."""
+        kinds, before = config.learns_from, ()
+        drives = self._drives(kinds)
         if params.encoders is not None:
             patches = replace(self.config.patches, patches=specialist.exteroception.patches)
             places = cache(lambda: PatchData.of(patches, *drives()))
             problem = AutoencoderProblem(patches)
             pair = problem.init_params(self._key(name))
-            pair = self._fit(f"{name}_autoencoders", problem, config.autoencoders, pair, places)
+            stage = f"{name}_autoencoders", problem, config.autoencoders, kinds
+            pair, digest = self._fit(*stage, pair, places)
+            before = (digest,)
             params = replace(params, encoders=autoencoders.encoders(pair))
             if isinstance(specialist, Nesam):
                 looks = {"encoders": params.encoders, "soil": params.soil}
                 problem = SoilProblem(patches)
-                looks = self._fit(f"{name}_soil", problem, self.config.soil, looks, places)
+                stage = f"{name}_soil", problem, self.config.soil, kinds
+                looks, digest = self._fit(*stage, looks, places, before)
+                before = (*before, digest)
                 params = replace(params, soil=looks["soil"])
         if isinstance(specialist, Nesam):
             params = nesam.calibrate(specialist, params, *self._sample(drives))
@@ -149,36 +165,42 @@ class _Stages:
             ("rollouts", rollouts, config.rollouts),
         ):
             problem = WindowProblem(specialist, objective, self.config.windows)
-            params = self._fit(f"{name}_{part}", problem, schedule, params, data)
-        return params
+            stage = f"{name}_{part}", problem, schedule, kinds
+            params, digest = self._fit(*stage, params, data, before)
+            before = (digest,)
+        return params, digest
 
-    def gate(self, verti_wm: VertiWM, params: VertiWMParams) -> VertiWMParams:
-        """The gate between two specialists."""
+    def gate(
+        self, verti_wm: VertiWM, params: VertiWMParams, before: Sequence[str]
+    ) -> VertiWMParams:
+        """The gate between two specialists, whose digests are given."""
         config = self.config.gate
         drives = self._drives(config.learns_from)
         params = model.calibrate(verti_wm, params, *self._sample(drives))
         objective = OpenLoop(verti_wm, self.config.loss, operator.attrgetter("coefficients"))
         problem = WindowProblem(verti_wm, objective, self.config.windows)
         data = cache(lambda: WindowData.of(self.config.windows, *drives()))
-        return self._fit("gate", problem, config.rollouts, params, data)
+        stage = "gate", problem, config.rollouts, config.learns_from
+        return self._fit(*stage, params, data, before)[0]
 
     def _fit(
         self,
         name: str,
         problem: Problem,
         config: FitConfig,
+        kinds: Sequence[Kind],
         params: Params,
         data: Callable[[], Any],
-    ) -> Any:
-        """The fitted parameters of a stage, from its folder if it has ended before."""
-        folder = self.run.folder / name
-        done = fitting.load(folder, params)
-        if done is not None:
-            return done
-        print(f"\n{name}", flush=True)
-        checkpoint = checkpoints.latest(folder / "checkpoints")
-        with self.run.part(name, int(checkpoint.name) if checkpoint else 0, config) as part:
-            return fitting.fit(problem, config, params, data(), self._key(name), part)
+        before: Sequence[str] = (),
+    ) -> tuple[Any, str]:
+        """The fitted parameters of a stage, and what later ones know its inputs by."""
+        files = [file for folder in self._folders(KINDS) for file in sorted(folder.glob("*.npz"))]
+        drives = tuple((file.name, file.stat().st_size) for file in files)
+        key = self._key(name)
+        seed = tuple(jax.random.key_data(key).tolist())
+        inputs = Inputs(problem, config, seed, tuple(kinds), drives, tuple(before))
+        fitted = stages.fit(self.run, name, inputs, params, data, key, self.reuse)
+        return fitted, inputs.digest
 
     def _key(self, name: str) -> jax.Array:
         return jax.random.fold_in(self.key, zlib.crc32(name.encode()))
@@ -191,6 +213,10 @@ class _Stages:
 
     def load(self, kinds: Sequence[Kind], split: Split) -> tuple[Drives, TerrainMap]:
         """Drives of these kinds in all folders, and of folders that are not divided into kinds."""
+        drives, terrain = dataset.load(self._folders(kinds), split)
+        return replace(drives, auxiliary=Auxiliary()), terrain
+
+    def _folders(self, kinds: Sequence[Kind]) -> list[Path]:
         chosen: list[Path] = []
         for folder in self.folders:
             chosen += [folder] if any(folder.glob("*.npz")) else []
@@ -200,8 +226,7 @@ class _Stages:
                 f"{', '.join(map(str, self.folders))}: expected files of drives, or folders of "
                 f"them named {' or '.join(kinds)}, found neither"
             )
-        drives, terrain = dataset.load(chosen, split)
-        return replace(drives, auxiliary=Auxiliary()), terrain
+        return chosen
 
     def _sample(self, drives: Callable) -> tuple[TerrainMap, VehicleState, Command]:
         """Some windows of the training drives as a measurement takes them, each on its world."""

@@ -16,6 +16,8 @@ GateTerrain = Literal["mean", "both"]
 CONTEXT_SIZE: dict[GateTerrain, int] = {"mean": 68, "both": 104}
 POSITION_AND_YAW = (-32, -31, -30, -27)
 """Where a context holds what depends on where the map lies: place and heading."""
+COEFFICIENTS = ("planar motion", "vertical motion", "tilt", "yaw")
+"""What the entries of alpha weigh."""
 _GROUPS = np.array([0, 0, 1, 2, 2, 3])
 
 

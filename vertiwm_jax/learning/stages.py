@@ -1,0 +1,85 @@
+"""Stages of a longer fit: each in a folder of its own, and done once for the same inputs."""
+
+import hashlib
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from vertiwm_jax import checkpoints, runs
+from vertiwm_jax.dynamics import Params
+from vertiwm_jax.learning import fitting
+from vertiwm_jax.learning.fitting import FitConfig, Problem
+from vertiwm_jax.runs import Run
+from vertiwm_jax.training import CheckpointConfig
+
+INPUTS = "inputs.txt"
+"""File in the folder of a stage that tells all that its result depends on."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """All that the result of a stage depends on, besides the program and the machine.
+
+    learns_from: kinds of drives; drives: all files of drives, of which the constants of a model
+        are measured, with their sizes. before: `digest` of the stages that it builds on.
+    """
+
+    problem: Problem
+    config: FitConfig
+    seed: tuple[int, ...]
+    learns_from: tuple[str, ...]
+    drives: tuple[tuple[str, int], ...]
+    before: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        schedule = replace(self.config, checkpoints=CheckpointConfig())
+        lines = [self.problem, schedule, self.seed, self.learns_from, *self.drives, *self.before]
+        return "".join(f"{line}\n" for line in lines)
+
+    @property
+    def digest(self) -> str:
+        return hashlib.sha256(str(self).encode()).hexdigest()
+
+
+def fit(
+    run: Run,
+    name: str,
+    inputs: Inputs,
+    params: Params,
+    data: Callable[[], Any],
+    key: jax.Array,
+    reuse: Sequence[Path],
+) -> Any:
+    """What `fitting.fit` gives, in the folder `name` of the run.
+
+    One that has ended with the same inputs is not repeated, whether there or in the folder of one
+    of the runs in `reuse`; one that has begun with them goes on from its newest checkpoint; one
+    with other inputs is thrown away.
+    """
+    folder = run.folder / name
+    if folder.exists() and not _is_of(folder, inputs):
+        print(f"\n{name}: its inputs have changed, it begins anew", flush=True)
+        shutil.rmtree(folder)
+    for other in reuse:
+        if not folder.exists() and _is_of(other / name, inputs):
+            print(f"\n{name}: from {other}", flush=True)
+            copy = run.folder / f".{name}"
+            shutil.copytree(other / name, copy, dirs_exist_ok=True)
+            copy.rename(folder)
+    done = fitting.load(folder, params)
+    if done is not None:
+        return done
+    print(f"\n{name}", flush=True)
+    checkpoint = checkpoints.latest(folder / "checkpoints")
+    with run.part(name, int(checkpoint.name) if checkpoint else 0, inputs.config) as part:
+        runs.write_atomic(folder / INPUTS, str(inputs))
+        return fitting.fit(inputs.problem, inputs.config, params, data(), key, part)
+
+
+def _is_of(folder: Path, inputs: Inputs) -> bool:
+    file = folder / INPUTS
+    return file.is_file() and file.read_text(encoding="utf-8") == str(inputs)
