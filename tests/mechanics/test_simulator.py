@@ -197,6 +197,19 @@ def test_stands_across_a_slope():
     assert state.rpy[-1, 0] == pytest.approx(-np.arctan(0.2), abs=0.03)
 
 
+def test_remembers_what_the_ground_did_to_each_wheel():
+    slope = ground(lambda x, y: 0.2 * x, SAND)
+    across = drive(slope, at_rest(slope, yaw=np.pi / 2)).history
+    normal, along, side = across.force[-1].T
+    assert normal.sum() == pytest.approx(WEIGHT * np.cos(np.arctan(0.2)), rel=0.01)
+    # Uphill is to the right.
+    assert side.sum() == pytest.approx(-WEIGHT * np.sin(np.arctan(0.2)), rel=0.05)
+    assert np.abs(along.sum()) < 0.01 * WEIGHT
+    assert across.wheels.soft[-1].all()
+    # In the body, which leans as the ground does.
+    np.testing.assert_allclose(across.wheels.normal.z[-1], 1, atol=1e-3)
+
+
 def test_friction_limits_what_it_climbs():
     rise = np.tan(np.radians(20))
     icy, rough = (ground(lambda x, y: rise * x, friction=mu) for mu in (0.2, 0.8))

@@ -17,10 +17,12 @@ from world_model.examples import (
 )
 
 from vertiwm_jax.dynamics import rollout
+from vertiwm_jax.learning import augment
+from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.networks.soil_predictor import SoilPredictor
-from vertiwm_jax.state import VehicleState
+from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.nesam import Nesam, calibrate
@@ -55,7 +57,6 @@ class Damped(Simulator):
 
 
 SIMPLE = replace(MODEL, simulator=Damped())
-READING = replace(SIMPLE, reads_patches=True)
 
 
 def standing(seed: int = 0, *batch: int) -> VehicleState:
@@ -113,35 +114,31 @@ def test_step_adds_what_the_network_says_in_its_scale():
     network["params"]["head"]["bias"] = bias = jnp.linspace(-1, 1, 12)
     found = predicted(MODEL, replace(UNTRAINED, network=network), state, control)
     physics = predicted(Simulator(), PHYSICS, state, control)
-    expected = motion.corrected(one(physics, 0), SCALE * bias)
+    # In a mirror, it would push the same way: what is odd cancels.
+    even = jnp.array([1, 0, 1, 0, 1, 0] * 2)
+    expected = motion.corrected(one(physics, 0), SCALE * even * bias)
     np.testing.assert_allclose(one(found, 0).vector, expected.vector, atol=1e-5)
 
 
 def test_cached_steps_along_a_drive_equal_the_whole_sequence():
     steps = WINDOW + 5
     drive, control = standing(1, steps), commands(steps)
-    params = READING.init_params(KEY, PHYSICS, CONSTANTS)
-    untrained = replace(params, correction_scale=SCALE)
-    params = moved(untrained)
 
     @jax.jit
     def cached(params, states, commands):
         def advance(carry, inputs):
             state, command = inputs
-            # Recorded states do not follow from each other as predicted ones do.
-            patches = READING.exteroception.query(TERRAIN, state)
-            seeing = replace(carry, perception=READING.perceive(params, patches))
-            proposed, history = READING.propose(params, TERRAIN, seeing, state, command)
+            proposed, history = SIMPLE.propose(params, TERRAIN, carry, state, command)
             return history, proposed
 
-        start = READING.init(params, TERRAIN, one(states, 0))
+        start = SIMPLE.init(params, TERRAIN, one(states, 0))
         return jax.lax.scan(advance, start, (states, commands))[1]
 
-    follow = jax.jit(READING.follow)
-    at_once = follow(params, TERRAIN, drive, control)
-    physics = follow(untrained, TERRAIN, drive, control)
+    follow = jax.jit(SIMPLE.follow)
+    at_once = follow(PARAMS, TERRAIN, drive, control)
+    physics = follow(UNTRAINED, TERRAIN, drive, control)
     assert float(jnp.abs(physics.velocity - at_once.velocity).max(-1).min()) > 1e-3
-    one_by_one = cached(params, drive, control)
+    one_by_one = cached(PARAMS, drive, control)
     np.testing.assert_allclose(one_by_one.vector, at_once.vector, atol=1e-4)
 
 
@@ -155,6 +152,28 @@ def test_place_and_heading_do_not_matter():
     expected = predicted(MODEL, PARAMS, state, control)
     np.testing.assert_allclose(found.position - shift, expected.position, atol=5e-3)
     np.testing.assert_allclose(found.rpy, expected.rpy, atol=5e-3)
+
+
+def test_a_mirrored_vehicle_on_mirrored_ground_drives_mirrored():
+    """Although nothing about the weights is symmetric."""
+    state, control = standing(4), commands(16)
+    both = augment.with_mirrored(TERRAIN)
+    image = replace(
+        TERRAIN,
+        **{name: getattr(both, name)[1:] for name in ("elevation", "semantic", "friction")},
+    )
+
+    def mirrored(state, control):
+        drive = Windows(state.vector, control.vector, jnp.int32(0), jnp.int32(0), 0)
+        seen = augment.mirror(drive, both)
+        return VehicleState.from_vector(seen.state), Command.from_vector(seen.control)
+
+    there, commanded = mirrored(state, control)
+    found = predicted(MODEL, PARAMS, there, commanded, image)
+    drive = predicted(MODEL, PARAMS, state, control)
+    np.testing.assert_allclose(found.vector, mirrored(drive, control)[0].vector, atol=2e-3)
+    alone = predicted(MODEL, UNTRAINED, state, control)
+    assert float(jnp.abs(drive.position - alone.position)[-1].max()) > 0.02
 
 
 def test_gradients_reach_all_weights_through_sixteen_steps():

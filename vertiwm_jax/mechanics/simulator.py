@@ -91,6 +91,9 @@ class SimulatorHistory:
     steering: `[]` rad, angle of the front wheels.
     sinkage: `[4]` m, of the wheels in soil; 0 on rigid ground.
     rut: `[2]` m, depth of the tracks that the rear wheels find, left and right.
+    wheels: how each wheel met the ground in the last sub-step.
+    force: `[4, 3]` N, of the ground on it: along the normal, along the rolling direction and to
+        the left.
     """
 
     wheel_speed: jax.Array
@@ -98,6 +101,8 @@ class SimulatorHistory:
     steering: jax.Array
     sinkage: jax.Array
     rut: jax.Array
+    wheels: Touch
+    force: jax.Array
 
 
 class _Body(NamedTuple):
@@ -118,15 +123,19 @@ class Simulator:
         self, params: SimulatorParams, terrain: TerrainMap, state: VehicleState
     ) -> SimulatorHistory:
         """Wheels roll without slip, stand where the springs carry the weight, steer ahead."""
-        vehicle = params.vehicle
-        rolling = state.velocity[0] / vehicle.wheel_radius
-        load = vehicle.mass * GRAVITY / 4 - vehicle.wheel_weight
+        vehicle, none = params.vehicle, jnp.zeros(4)
+        load = vehicle.mass * GRAVITY / 4
+        travel = vehicle.free_travel + (load - vehicle.wheel_weight) / vehicle.spring
+        position = Vector.of(state.position)
+        axes = Axes.from_quaternion(geometry.rotation_from_rpy(state.rpy).wxyz)
         return SimulatorHistory(
-            wheel_speed=jnp.full(4, rolling),
-            travel=vehicle.free_travel + load / vehicle.spring,
+            wheel_speed=jnp.full(4, state.velocity[0] / vehicle.wheel_radius),
+            travel=travel,
             steering=jnp.zeros(()),
-            sinkage=jnp.zeros(4),
+            sinkage=none,
             rut=jnp.zeros(2),
+            wheels=touch(vehicle, terrain, position, axes, travel, none, none)[0],
+            force=jnp.zeros((4, 3)).at[:, 0].set(load),
         )
 
     def step(
@@ -229,6 +238,8 @@ def _substep(
         steering=steering,
         sinkage=jnp.where(wheels.edge, before, sinkage),
         rut=history.rut + fresh * (sinkage[:2] - history.rut),
+        wheels=wheels,
+        force=jnp.stack([load, traction, ground.lateral], axis=-1),
     )
     return _advance_pose(vehicle, body, axes, centre, twist, seconds), history
 

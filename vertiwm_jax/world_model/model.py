@@ -85,8 +85,6 @@ class ModelConfig:
     """Of both specialists' networks."""
     terrain: Literal["patches", "indicator", "none"] = "patches"
     """What the Transformer is told of the ground; less than patches only to compare with."""
-    reads_patches: bool = False
-    """Whether NeSAM's correction sees encoded patches beside what physics makes of the ground."""
     soil: Literal["map", "predicted"] = "map"
     """Whether NeSAM uses the soils of the map or predicts them from what the ground looks like."""
     gate_terrain: GateTerrain = "mean"
@@ -110,7 +108,7 @@ class ModelConfig:
     @property
     def nesam(self) -> Nesam:
         """The specialist for soil."""
-        return Nesam(_SIZES[self.size], reads_patches=self.reads_patches, soil=self.soil)
+        return Nesam(_SIZES[self.size], soil=self.soil)
 
     def build(self) -> "VertiWM":
         """Both fused."""

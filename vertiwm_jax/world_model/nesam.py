@@ -14,18 +14,13 @@ from vertiwm_jax.networks.transformer import KeyValueCache
 from vertiwm_jax.state import Command, Patches, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
-from vertiwm_jax.world_model import motion
-from vertiwm_jax.world_model.normalisation import LOCAL, Normalisation
+from vertiwm_jax.world_model import motion, step_features
+from vertiwm_jax.world_model.normalisation import Normalisation
 from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception
 from vertiwm_jax.world_model.sizes import BASE, TransformerSize
 from vertiwm_jax.world_model.specialist_network import SpecialistNetwork
+from vertiwm_jax.world_model.step_features import StepFeatures
 
-FEATURES = LOCAL.size + 2 + 12 + 12 + 15
-"""Of a token besides the ground: state, command, proposal, last error, memory of physics."""
-LARGEST_INPUT = 8.0
-"""Where inputs of the network are cut off, lest a crash blind it for a whole window."""
-TRAVEL, SINKAGE = 0.05, 0.1
-"""Typical travel of a wheel, and typical depth of a track in soil, m."""
 _SOIL = SoilPredictor()
 NUDGE = 0.05
 """Change of velocities, m/s and rad/s, by which `calibrate` measures how physics answers."""
@@ -69,12 +64,12 @@ class NesamHistory:
 class Nesam:
     """The `Dynamics` F_N: a step of the simulator, whose next state is then corrected.
 
-    What it corrects depends on neither place, height nor heading.
+    The correction depends on neither place, height nor heading, and is mirrored when the vehicle
+    and its ground are: the network reads every step twice, the second time as in a mirror, and the
+    mean of both answers counts. It sees the ground through what physics makes of it, so a rollout
+    that nobody asks what it saw needs no encoders.
 
     residual: whether physics is corrected at all.
-    reads_patches: whether the correction sees encoded patches, beside what physics makes of the
-        ground. Without, learning needs no encoders: XLA leaves them out of a rollout that nobody
-        asks what it saw.
     gradient: "exact" through the simulator; or "mean", several times cheaper, as if what it
         proposes depended on the velocities alone, and on them linearly (`NesamParams.response`).
         Values are the same.
@@ -85,7 +80,6 @@ class Nesam:
 
     size: TransformerSize = BASE
     residual: bool = True
-    reads_patches: bool = False
     gradient: Literal["exact", "mean"] = "mean"
     soil: Literal["map", "predicted"] = "map"
     exteroception: Exteroception = Exteroception()
@@ -100,9 +94,8 @@ class Nesam:
         """Physics as it is, and a network that leaves it so; see `calibrate` before learning."""
         encoder_key, network_key, soil_key = jax.random.split(key, 3)
         latent = jnp.zeros((16, 16, LATENT_CHANNELS))
-        ground = jnp.zeros((1, 16, 16, 2 * LATENT_CHANNELS)) if self.reads_patches else None
         return NesamParams(
-            network=self._network.init(network_key, jnp.zeros((1, FEATURES)), ground),
+            network=self._network.init(network_key, jnp.zeros((1, step_features.SIZE)), None),
             encoders=self.exteroception.init_params(encoder_key),
             soil=_SOIL.init(soil_key, latent, jnp.float32(0)),
             simulator=simulator,
@@ -113,7 +106,7 @@ class Nesam:
 
     def init(self, params: NesamParams, terrain: TerrainMap, state: VehicleState) -> NesamHistory:
         """The simulator's history, an empty cache and a look at the ground."""
-        empty = self._network.apply(params.network, method=SpecialistNetwork.empty_cache)
+        empty = self._network.apply(params.network, (2,), method=SpecialistNetwork.empty_cache)
         cache = cast(KeyValueCache, empty) if self.residual else None
         memory = self.simulator.init(params.simulator, terrain, state)
         return NesamHistory(memory, cache, state, self._look(params, terrain, state))
@@ -145,14 +138,13 @@ class Nesam:
         if not self.residual:
             return physics, following
         features = _features(params, history.physics, state, command, physics, memory)
-        seen = history.perception.latent if self.reads_patches else None
-        output, cache = cast(
+        outputs, cache = cast(
             tuple[jax.Array, KeyValueCache],
             self._network.apply(
-                params.network, features, seen, history.cache, method=SpecialistNetwork.step
+                params.network, features, None, history.cache, method=SpecialistNetwork.step
             ),
         )
-        correction = _fixed(params.correction_scale) * output
+        correction = _correction(params, outputs)
         return motion.corrected(physics, correction), replace(following, cache=cache)
 
     def perceive(self, params: NesamParams, patches: Patches) -> Perception:
@@ -176,10 +168,8 @@ class Nesam:
             return physics
         expected = jax.tree.map(lambda x, y: jnp.concatenate([x[:1], y[:-1]]), states, physics)
         features = _features(params, expected, states, commands, physics, memories)
-        seen = jax.vmap(lambda state: self._look(params, terrain, state))(states)
-        ground = seen.latent if self.reads_patches else None
-        output = cast(jax.Array, self._network.apply(params.network, features, ground))
-        return motion.corrected(physics, _fixed(params.correction_scale) * output)
+        outputs = cast(jax.Array, self._network.apply(params.network, features, None))
+        return motion.corrected(physics, _correction(params, outputs))
 
     def physics_along(
         self,
@@ -289,24 +279,18 @@ def _features(
     physics: VehicleState,
     memory: SimulatorHistory,
 ) -> jax.Array:
-    """What the network reads, `[..., FEATURES]`, of any number of steps.
+    """What the network reads of any number of steps `[...]`, and in a mirror: `[2, ..., F]`."""
+    constants, scale, vehicle = _fixed(
+        (params.normalisation, params.correction_scale, params.simulator.vehicle)
+    )
+    seen = StepFeatures.of(constants, scale, vehicle, expected, state, command, physics, memory)
+    return jnp.stack([seen.flat, seen.mirrored.flat])
 
-    expected: what physics had made of `state`; physics, memory: what it makes of the next.
-    """
-    constants, vehicle = params.normalisation, _fixed(params.simulator.vehicle)
-    slip = vehicle.wheel_radius * memory.wheel_speed - physics.velocity[..., :1]
-    parts = [
-        constants.state(state.vector),
-        constants.command(command.vector),
-        motion.transition(state, physics) / _fixed(constants.transition_deviation),
-        motion.difference(expected, state) / _fixed(params.correction_scale),
-        jnp.arcsinh(slip),
-        (memory.travel - vehicle.free_travel) / TRAVEL,
-        memory.steering[..., None] / vehicle.steering_limit,
-        memory.sinkage / SINKAGE,
-        memory.rut / SINKAGE,
-    ]
-    return jnp.clip(jnp.concatenate(parts, axis=-1), -LARGEST_INPUT, LARGEST_INPUT)
+
+def _correction(params: NesamParams, outputs: jax.Array) -> jax.Array:
+    """`[..., 12]` of the outputs `[2, ..., 12]` for a step and its mirror image."""
+    mean = 0.5 * (outputs[0] + step_features.MOTION_SIGNS * outputs[1])
+    return _fixed(params.correction_scale) * mean
 
 
 def _fixed(tree: Any) -> Any:

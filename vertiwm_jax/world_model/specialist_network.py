@@ -36,8 +36,9 @@ class SpecialistNetwork(nn.Module):
         token, cache = self.transformer.step(self._tokens(features, ground), cache)
         return self.head(token), cache
 
-    def empty_cache(self) -> KeyValueCache:
-        return self.transformer.empty_cache()
+    def empty_cache(self, batch: tuple[int, ...] = ()) -> KeyValueCache:
+        """As `Transformer.empty_cache`."""
+        return self.transformer.empty_cache(batch)
 
     def _tokens(self, features: jax.Array, ground: jax.Array | None) -> jax.Array:
         """ground: a latent `[..., 16, 16, 36]`, an indicator `[..., 1]`, or nothing."""
