@@ -282,8 +282,9 @@ def calibrate(
 
 
 def save(folder: Path, config: ModelConfig, params: VertiWMParams) -> None:
-    """Write a model to `folder`, for `load`; raises what `checkpoints.save` raises."""
-    checkpoints.save(folder, 0, params, keep=1)
+    """Write a model to `folder`, for `load`, in place of one there; as `checkpoints.save`."""
+    before = checkpoints.latest(folder)
+    checkpoints.save(folder, int(before.name) + 1 if before else 0, params, keep=1)
     configuration.save(config, folder / _CONFIG)
 
 
