@@ -13,8 +13,8 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from benchmarks._harness import Figures, measure, parser, report
-from vertiwm_jax import ppo as door
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
 from vertiwm_jax.rl.ppo import PPO
 
@@ -45,16 +45,16 @@ class IdleEnv(environment.Environment):
 def iteration(ppo: PPO, params: Any, repeat: int = 1) -> Figures:
     state = jax.jit(ppo.init)(params, jax.random.key(0))
     figures = measure(jax.jit(ppo.iterate), params, state, repeats=3)
-    return {"transitions_per_s": repeat * ppo.config.batch / figures["median_s"], **figures}
+    return {"transitions_per_s": repeat * ppo.config.collected / figures["median_s"], **figures}
 
 
 def main() -> None:
     arguments = parser(__doc__).parse_args()
-    config = door.TrainConfig()
+    config = PPOTraining()
     params = environment.EnvParams(max_steps_in_episode=600)
     results = {"algorithm alone": iteration(PPO(IdleEnv(), config.ppo), params)}
     training, _ = task.environments(config)
-    ppo = door.algorithm(config, training.env)
+    ppo = config.algorithm(training.env)
     results["built-in simulator"] = iteration(ppo, training.params, config.action_repeat)
     report("ppo_throughput", results, arguments.json)
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from doors import opened, refusal
 
-from vertiwm_jax import checkpoints, evaluate, ppo, runs
+from vertiwm_jax import checkpoints, evaluate, policy_training, ppo, runs, sac, td3
 from vertiwm_jax import config as configuration
-from vertiwm_jax.ppo import TrainConfig
+from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain import files
@@ -64,8 +64,8 @@ def numbers(run):
 
 
 def learned(run):
-    config = configuration.load(TrainConfig, run / "config.yaml")
-    return ppo.learned(config, task.held_out(config), run)
+    config = evaluate.training(run / "config.yaml")
+    return policy_training.learned(config, task.held_out(config), run)
 
 
 def test_a_run_leaves_all_that_was_promised(run, folder):
@@ -87,8 +87,8 @@ def test_a_run_leaves_all_that_was_promised(run, folder):
         assert (run / f"trajectories_{difficulty}.png").is_file()
         assert f"**{difficulty}**" in (run / "summary.md").read_text()
     assert sum(rows["ppo"]["tasks"] for rows in summary.values()) == 4
-    asked = configuration.load(TrainConfig, folder / "tiny.yaml")
-    assert configuration.load(TrainConfig, run / "config.yaml").ppo == asked.ppo
+    asked = configuration.load(PPOTraining, folder / "tiny.yaml")
+    assert configuration.load(PPOTraining, run / "config.yaml").ppo == asked.ppo
 
 
 def test_resuming_is_as_if_never_stopped(run, train, monkeypatch):
@@ -112,6 +112,28 @@ def test_resuming_is_as_if_never_stopped(run, train, monkeypatch):
     assert (stopped / "config.yaml").read_text() == (run / "config.yaml").read_text()
 
 
+@pytest.mark.parametrize("door", [sac, pytest.param(td3, marks=pytest.mark.slow)])
+def test_other_algorithms_leave_the_same_and_resume(door, folder, tmp_path, monkeypatch):
+    name = door.__name__.split(".")[-1]
+    settings = "{transitions: 192, num_envs: 8, num_steps: 8, updates: 1, batch: 8, capacity: 64, "
+    settings += "warm_up: 64, hidden: [8]}"
+    tiny = TINY[: TINY.index("planning")] + f"{name}: {settings}\nloop: {{checkpoint_every: 2}}\n"
+    (tmp_path / "tiny.yaml").write_text(tiny)
+    with opened(door.main, folder, "--config", str(tmp_path / "tiny.yaml")) as train:
+        run = train()
+        assert run.name.startswith(name)
+        assert [line["step"] for line in runs.read_metrics(run)] == [1, 2, 3]
+        stopped = shutil.copytree(run, tmp_path / "stopped")
+        shutil.rmtree(stopped / "checkpoints" / "3")
+        train("--resume", str(stopped))
+    assert numbers(stopped) == numbers(run)
+    chex.assert_trees_all_equal(learned(stopped), learned(run))
+    evaluate.main(["navigation", "--policy", str(run), "--json", str(tmp_path / "found.json")])
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert found == json.loads((run / "summary.json").read_text())
+    assert all(name in rows for rows in found.values())
+
+
 def test_what_is_set_beside_resume_is_kept(run, train, tmp_path):
     again = shutil.copytree(run, tmp_path / "again")
     before = (again / "config.yaml").read_text()
@@ -120,7 +142,7 @@ def test_what_is_set_beside_resume_is_kept(run, train, tmp_path):
     assert (again / "config.yaml").read_text() == before
     train("--resume", str(again), "--ppo.transitions", "320")
     assert [line["step"] for line in numbers(again)] == [1, 2, 3, 4, 5]
-    config = configuration.load(TrainConfig, again / "config.yaml")
+    config = configuration.load(PPOTraining, again / "config.yaml")
     assert config.ppo.transitions == 320 and config.resume is None
 
 

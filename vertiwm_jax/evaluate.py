@@ -10,7 +10,7 @@ from typing import Literal
 import tyro
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import ppo, runs
+from vertiwm_jax import policy_training, runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.dynamics import Dynamics, Params
@@ -21,9 +21,12 @@ from vertiwm_jax.fit import FitConfig
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.ppo import TrainConfig
+from vertiwm_jax.policy_training import TrainConfig
+from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.runs import RunError
+from vertiwm_jax.sac import SACTraining
+from vertiwm_jax.td3 import TD3Training
 from vertiwm_jax.terrain.worlds import Difficulty
 from vertiwm_jax.world_model.choice import ModelName, choose, fitted
 
@@ -131,7 +134,7 @@ def _navigate(command: Navigation) -> None:
     run = command.policy if isinstance(command.policy, Path) else None
     file = run / "config.yaml" if run else configuration.default_config("ppo")
     try:
-        config = _adapted(configuration.load(TrainConfig, file), command)
+        config = _adapted(training(file), command)
         grounds, maps = config.ground, command.worlds
         terrain = ground.load(grounds, maps) if maps else task.held_out(config)
         test = task.test_environment(config, terrain)
@@ -139,7 +142,7 @@ def _navigate(command: Navigation) -> None:
         sys.exit(f"error: {error}")
     policies = baselines(config.navigation)
     if run:
-        policies = ppo.learned(config, terrain, run) | policies
+        policies = policy_training.learned(config, terrain, run) | policies
     elif command.policy == "straight":
         policies = {REFERENCE: policies[REFERENCE]}
     groups = report.drive(test.env, test.params, policies, config.key("testing"))
@@ -147,6 +150,14 @@ def _navigate(command: Navigation) -> None:
     if command.json:
         numbers = json.dumps(report.summary(groups, REFERENCE), indent=2)
         runs.write_atomic(command.json, numbers + "\n")
+
+
+def training(file: Path) -> TrainConfig:
+    """The configuration of a training, by the algorithm whose settings are in the file."""
+    text = file.read_text(encoding="utf-8") if file.is_file() else ""
+    kinds = (PPOTraining, SACTraining, TD3Training)
+    named = [kind for kind in kinds if f"\n{kind.name}:" in text]
+    return configuration.load(named[0] if named else PPOTraining, file)
 
 
 def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:

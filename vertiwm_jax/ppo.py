@@ -1,200 +1,32 @@
 """`python -m vertiwm_jax.ppo`: train a driving policy by PPO and show how well it drives."""
 
-import json
-import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
-import jax
-import numpy as np
-
-from vertiwm_jax import config as configuration
-from vertiwm_jax import runs
-from vertiwm_jax.checkpoints import CheckpointError
-from vertiwm_jax.env.driver import Driver, Policy
-from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
+from vertiwm_jax import policy_training
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import ARCS
-from vertiwm_jax.env.repeat import ActionRepeat, Controller
-from vertiwm_jax.evaluation import plots, report
-from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
-from vertiwm_jax.evaluation.report import Results, drive
-from vertiwm_jax.rl import ground, task
-from vertiwm_jax.rl.learned import Corrected
-from vertiwm_jax.rl.loop import LoopConfig, restore, train
-from vertiwm_jax.rl.planning import Planner, PlanningConfig
-from vertiwm_jax.rl.ppo import PPO, PPOConfig, TrainState
-from vertiwm_jax.rl.task import TaskConfig
-from vertiwm_jax.runs import Run, RunError
-from vertiwm_jax.state import STEP_SECONDS
-from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.training import TrainingError, TrainingInterrupted
-
-Rows = dict[str, Policy | Driver]
-
-CURVES = {
-    "episode_return": "return",
-    "success": "success",
-    "episode_length": "episode [steps]",
-    "entropy": "entropy [nats]",
-    "kl": "KL divergence",
-    "explained_variance": "explained variance",
-}
+from vertiwm_jax.policy_training import TrainConfig
+from vertiwm_jax.rl import task
+from vertiwm_jax.rl.ppo import PPO, PPOConfig
 
 
 @dataclass(frozen=True)
-class TrainConfig(TaskConfig):
+class PPOTraining(TrainConfig):
     """Train an off-road driving policy by PPO inside a model of the vehicle."""
 
-    runs: Path = Path("runs")
-    """Folder in which the folder of this run is made."""
-    resume: Path | None = None
-    """Folder of an earlier run to go on with; what is set beside changes its configuration."""
-    compile_cache: Path | None = None
-    """Folder that keeps compiled programs for later runs."""
-    action_repeat: int = 4
-    """Steps of 0.1 s that an action is held while learning; ppo.transitions counts actions."""
-    base: Literal["look ahead", "straight to goal", "none"] = "look ahead"
-    """The controller that the policy learns to correct; it acts at every step."""
-    planning: PlanningConfig | None = None
-    """How the policy plans in tests, besides driving as it is; learning does not need it."""
+    name: ClassVar[str] = "ppo"
     ppo: PPOConfig = PPOConfig()
     """The algorithm."""
-    loop: LoopConfig = LoopConfig()
-    """Seeds and checkpoints."""
+
+    def algorithm(self, env: NavigationEnv) -> PPO:
+        return PPO(self.repeated(env), self.ppo, task.outcomes, ARCS)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
-    config = _configuration(argv)
-    try:
-        run_folder = _train_and_report(config)
-    except TrainingInterrupted as stopped:
-        print(stopped)
-        sys.exit(130)
-    except KeyboardInterrupt:
-        print("stopped at once; go on from the newest checkpoint with --resume and the run folder")
-        sys.exit(130)
-    except (RunError, CheckpointError, TrainingError) as error:
-        sys.exit(f"error: {error}")
-    print(f"all of it is in {run_folder}")
-
-
-def learned(config: TrainConfig, terrain: TerrainMap, run: Path) -> Rows:
-    """The policies of the run in the folder `run`, one a seed; `CheckpointError` if none.
-
-    terrain: any worlds that tests can be drawn on.
-    """
-    tasks = ground.test_tasks(config.ground, terrain)
-    made = task.environment(config, config.model, terrain, tasks)
-    ppo, params = algorithm(config, made.env), made.params
-    restored = restore(ppo, params, run, config.loop.seeds)
-    if restored is None:
-        raise CheckpointError(f"{run}: expected checkpoints of a training, found none")
-    return _policies(config, ppo, params, restored[1])
-
-
-def _configuration(argv: Sequence[str] | None) -> TrainConfig:
-    return configuration.parse_resumable(TrainConfig, "ppo", argv, "python -m vertiwm_jax.ppo")
-
-
-def algorithm(config: TrainConfig, env: NavigationEnv) -> PPO:
-    """PPO on the task as the configuration has it."""
-    repeated = ActionRepeat(env, config.action_repeat, _base(config))
-    return PPO(repeated, config.ppo, task.outcomes, ARCS)
-
-
-def _base(config: TrainConfig) -> Controller | None:
-    return None if config.base == "none" else baselines(config.navigation)[config.base]
-
-
-def _policies(config: TrainConfig, ppo: PPO, params: NavigationParams, state: TrainState) -> Rows:
-    base, rows = _base(config), {}
-    for seed in range(config.loop.seeds):
-        of_seed = jax.tree.map(lambda x, seed=seed: x[seed], state)
-        policy, name = ppo.policy(params, of_seed), "ppo"
-        if config.loop.seeds > 1:
-            name = f"ppo, seed {seed}"
-        rows[name] = Corrected(base, policy) if base else policy
-        if config.planning:
-            dynamics, weights = task.dynamics(config, config.planning.model)
-            rows[f"{name} with planning"] = Planner(
-                env=NavigationEnv(dynamics, config.navigation),
-                dynamics=weights,
-                policy=policy,
-                value=ppo.value(of_seed),
-                base=base,
-                interval=config.action_repeat,
-                discount=config.ppo.discount,
-                config=config.planning,
-            )
-    return rows
-
-
-def _train_and_report(config: TrainConfig) -> Path:
-    if config.compile_cache:
-        jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
-    try:
-        training, test = task.environments(config)
-    except ValueError as error:  # what is wrong with the maps, or with the tasks on them
-        sys.exit(f"error: {error}")
-    env, params = training.env, training.params
-    ppo, seeds, iterations = algorithm(config, env), config.loop.seeds, config.ppo.iterations
-    steps = config.ppo.batch * config.action_repeat
-    restored = restore(ppo, params, config.resume, seeds) if config.resume else None
-    with _open(config, restored[0] if restored else 0) as run:
-        print(f"run folder {run.folder}", flush=True)
-        print(f"training in {config.model} on {params.terrain.worlds} worlds", flush=True)
-        key = config.key("training")
-        state = train(ppo, params, key, run, iterations, steps, config.loop, restored)
-        policies = _policies(config, ppo, params, state) | baselines(config.navigation)
-        driven = drive(test.env, test.params, policies, config.key("testing"))
-        _report(run, config, test.params, driven)
-    return run.folder
-
-
-def _open(config: TrainConfig, done: int) -> Run:
-    settings = replace(config, resume=None)
-    if config.resume is None:
-        return Run.create(config.runs, "ppo", settings)
-    return Run.open(config.resume, done, settings)
-
-
-def _report(
-    run: Run, config: TrainConfig, test: NavigationParams, groups: Mapping[str, Results]
-) -> None:
-    table = report.markdown(groups, REFERENCE)
-    print(f"\n{table}\n")
-    runs.write_atomic(run.folder / "summary.md", table + "\n")
-    numbers = json.dumps(report.summary(groups, REFERENCE), indent=2)
-    runs.write_atomic(run.folder / "summary.json", numbers + "\n")
-    _draw(run, config, test, groups)
-
-
-def _draw(
-    run: Run, config: TrainConfig, test: NavigationParams, groups: Mapping[str, Results]
-) -> None:
-    """Learning curves, and for each difficulty a drive to a goal that is hard to reach."""
-    columns = runs.read_columns(run.folder)
-    labels = {name: label for name, label in CURVES.items() if name in columns}
-    figure = plots.learning_curves({"ppo": columns}, "transitions", labels, "transitions")
-    plots.save(figure, run.folder / "learning_curves.png")
-    for name, results in groups.items():
-        reference = results[REFERENCE]
-        # The first task that the reference fails, better still one that a learned policy solves.
-        failed = ~np.asarray(reference.success)
-        solved = np.asarray(next(iter(results.values())).success)
-        hard = int(np.argmax(2 * failed + solved))
-        figure = plots.trajectories(
-            test.terrain,
-            int(reference.world[hard]),
-            {policy: result.path(hard) for policy, result in results.items()},
-            np.asarray(reference.goal[hard]),
-            config.navigation.goal_radius,
-            STEP_SECONDS,
-        )
-        plots.save(figure, run.folder / f"trajectories_{name}.png")
+    policy_training.main(PPOTraining, argv)
 
 
 if __name__ == "__main__":

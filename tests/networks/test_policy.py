@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from vertiwm_jax.networks.policy import LOG_STD_BOUNDS, Actor, Candidates, Critic, Gaussian
+from vertiwm_jax.networks.policy import (
+    LOG_STD_BOUNDS,
+    ActionCritic,
+    Actor,
+    Candidates,
+    Critic,
+    Gaussian,
+    Squashed,
+    SquashedActor,
+)
 
 RNG = np.random.default_rng(0)
 MEAN = RNG.normal(size=(5, 3)).astype(np.float32)
@@ -109,3 +118,34 @@ def test_the_action_of_the_candidate_attended_to_is_taken():
     seen = jnp.array([[-1.0, 0, 1, 0, -1, 0], [-1, 0, -1, 0, 1, 0]])
     mean = actor.apply(params, jnp.concatenate([seen, jnp.zeros((2, 4))], -1)).mean
     np.testing.assert_allclose(mean, [[0.5, 0.0], [0.0, 1.0]], atol=1e-4)
+
+
+def test_density_of_squashed_actions_is_that_of_the_change_of_variables():
+    gaussian = Gaussian(jnp.asarray(MEAN), jnp.asarray(LOG_STD))
+    action, log_prob = Squashed(gaussian).sample(jax.random.key(0))
+    assert float(jnp.max(jnp.abs(action))) <= 1
+    exact = np.clip(np.asarray(action, np.float64), -1 + 1e-6, 1 - 1e-6)
+    density = scipy.stats.norm.logpdf(np.arctanh(exact), MEAN, np.exp(LOG_STD))
+    expected = (density - np.log(1 - exact**2)).sum(-1)
+    near = np.all(np.abs(exact) < 0.999, axis=-1)
+    assert near.sum() >= 2
+    np.testing.assert_allclose(np.asarray(log_prob)[near], expected[near], rtol=1e-3, atol=1e-3)
+    far = Squashed(Gaussian(jnp.full(2, 50.0), jnp.zeros(2))).sample(jax.random.key(1))[1]
+    assert bool(jnp.isfinite(far))
+
+
+def test_squashed_actor_starts_near_zero_with_the_deviation_asked_for():
+    actor = SquashedActor(actions=2, hidden=(16, 16), initial_log_std=-0.9)
+    observation = jax.random.normal(jax.random.key(1), (64, 7))
+    policy = actor.apply(actor.init(jax.random.key(0), observation), observation)
+    assert policy.mean.shape == (64, 2) and float(jnp.max(jnp.abs(policy.mean))) < 0.1
+    np.testing.assert_allclose(policy.gaussian.log_std, -0.9, atol=0.1)
+
+
+def test_action_critic_weighs_actions():
+    critic = ActionCritic(hidden=(8,))
+    observation, action = jnp.ones((3, 4, 5)), jnp.zeros((3, 4, 2))
+    params = critic.init(jax.random.key(0), observation, action)
+    value = critic.apply(params, observation, action)
+    assert value.shape == (3, 4)
+    assert not np.allclose(value, critic.apply(params, observation, action + 0.5))

@@ -1,7 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.rl.advantages import discounted_returns, generalised_advantages
+from vertiwm_jax.rl.advantages import generalised_advantages
 
 RNG = np.random.default_rng(0)
 T, N = 12, 5
@@ -31,16 +31,3 @@ def test_a_value_that_is_not_a_number_after_the_end_does_no_harm():
     arrays = (REWARDS, VALUES, next_values, TERMINATED, TRUNCATED)
     found = generalised_advantages(*map(jnp.asarray, arrays), DISCOUNT, TRACE)
     assert bool(jnp.all(jnp.isfinite(found)))
-
-
-def test_discounted_returns_equal_a_plain_loop():
-    previous = RNG.normal(size=N).astype(np.float32)
-    done = TERMINATED | TRUNCATED
-    carried, expected = previous.astype(float), np.zeros((T, N))
-    for t in range(T):
-        expected[t] = DISCOUNT * carried + REWARDS[t]
-        carried = np.where(done[t], 0.0, expected[t])
-    arrays = (jnp.asarray(previous), jnp.asarray(REWARDS), jnp.asarray(done))
-    last, found = discounted_returns(*arrays, DISCOUNT)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(last, carried, rtol=1e-5, atol=1e-6)

@@ -43,7 +43,9 @@ def train(ppo, env_params=ProbeParams(), seed=0, iterations=None):
 
 
 def values(ppo, state, *observations):
-    return np.asarray(ppo.value(state)(jnp.array(observations, jnp.float32)[:, None]))
+    return np.asarray(
+        ppo.value(ProbeParams(), state)(jnp.array(observations, jnp.float32)[:, None])
+    )
 
 
 @pytest.mark.parametrize("normalise", [False, True])
@@ -54,7 +56,7 @@ def test_constant_reward_is_its_value(normalise):
     np.testing.assert_allclose(values(ppo, state, 0.0), 1.0, atol=0.02)
     assert float(metrics["episode_return"]) == 1.0
     assert float(metrics["episode_length"]) == 1.0
-    assert float(metrics["episodes"]) == CONFIG.batch
+    assert float(metrics["episodes"]) == CONFIG.collected
 
 
 @pytest.mark.parametrize("normalise", [False, True])
@@ -70,7 +72,7 @@ def test_delayed_reward_is_discounted():
     np.testing.assert_allclose(values(ppo, state, 0.0, 1.0), [0.9, 1.0], atol=0.03)
     assert float(metrics["last"]) == 2.0
     assert float(metrics["episode_return"]) == 1.0
-    assert float(metrics["episodes"]) == CONFIG.batch / 2
+    assert float(metrics["episodes"]) == CONFIG.collected / 2
 
 
 @pytest.mark.parametrize("normalise", [False, True])

@@ -39,6 +39,25 @@ class Gaussian:
         return jnp.sum(self.log_std + 0.5 * math.log(2 * math.pi * math.e), axis=-1)
 
 
+@struct.dataclass
+class Squashed:
+    """A Gaussian over numbers whose tanh are actions (Haarnoja et al., 2018, appendix C)."""
+
+    gaussian: Gaussian
+
+    @property
+    def mean(self) -> jax.Array:
+        """`[..., A]` the action in the middle, which is the median."""
+        return jnp.tanh(self.gaussian.mean)
+
+    def sample(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """`[..., A]` one action each in (-1, 1), and their log densities `[...]`."""
+        raw = self.gaussian.sample(key)
+        # log(1 - tanh^2), in a form that is finite everywhere.
+        slope = 2 * (math.log(2) - raw - nn.softplus(-2 * raw))
+        return jnp.tanh(raw), self.gaussian.log_prob(raw) - jnp.sum(slope, axis=-1)
+
+
 class MLP(nn.Module):
     """tanh layers of the given widths and a linear output, orthogonally initialised.
 
@@ -113,11 +132,8 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> Gaussian:
-        if self.candidates is None:
-            mean = MLP(self.hidden, self.actions, output_gain=0.01)(observation)
-        else:
-            features, attended = Attention(self.hidden, self.candidates)(observation)
-            mean = attended + MLP(self.hidden[-1:], self.actions, output_gain=0.01)(features)
+        features, attended, hidden = _look(observation, self.hidden, self.candidates)
+        mean = attended + MLP(hidden, self.actions, output_gain=0.01)(features)
         low, high = LOG_STD_BOUNDS
         share = (self.initial_log_std - low) / (high - low)
         initial = nn.initializers.constant(math.log(share / (1 - share)))
@@ -133,8 +149,54 @@ class Critic(nn.Module):
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
-        hidden, features = self.hidden, observation
-        if self.candidates is not None:
-            features, _ = Attention(hidden, self.candidates)(observation)
-            hidden = hidden[-1:]
+        features, _, hidden = _look(observation, self.hidden, self.candidates)
         return MLP(hidden, 1, output_gain=1.0)(features)[..., 0]
+
+
+class SquashedActor(nn.Module):
+    """`[..., O]` observations to `Squashed` Gaussians over actions, whose width is learned too.
+
+    For algorithms that learn from what earlier policies did. With candidates the mean corrects
+    the mean of those attended to, before the tanh.
+    """
+
+    actions: int
+    hidden: Sequence[int]
+    initial_log_std: float
+    candidates: Candidates | None = None
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> Squashed:
+        features, attended, hidden = _look(observation, self.hidden, self.candidates)
+        outputs = MLP(hidden, 2 * self.actions, output_gain=0.01)(features)
+        mean, raw = jnp.split(outputs, 2, axis=-1)
+        low, high = LOG_STD_BOUNDS
+        share = (self.initial_log_std - low) / (high - low)
+        log_std = low + (high - low) * nn.sigmoid(raw + math.log(share / (1 - share)))
+        return Squashed(Gaussian(attended + mean, log_std))
+
+
+class ActionCritic(nn.Module):
+    """`[..., O]` observations and `[..., A]` actions to `[...]` values."""
+
+    hidden: Sequence[int]
+    candidates: Candidates | None = None
+
+    @nn.compact
+    def __call__(self, observation: jax.Array, action: jax.Array) -> jax.Array:
+        features, _, hidden = _look(observation, self.hidden, self.candidates)
+        inputs = jnp.concatenate([features, action], axis=-1)
+        return MLP(hidden, 1, output_gain=1.0)(inputs)[..., 0]
+
+
+def _look(
+    observation: jax.Array, hidden: Sequence[int], candidates: Candidates | None
+) -> tuple[jax.Array, jax.Array | float, Sequence[int]]:
+    """Features `[..., F]`, the mean of attended actions, 0 without any, and layers still to come.
+
+    Part of a module's compact method.
+    """
+    if candidates is None:
+        return observation, 0.0, hidden
+    features, attended = Attention(hidden, candidates)(observation)
+    return features, attended, hidden[-1:]

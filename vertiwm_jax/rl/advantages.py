@@ -31,21 +31,3 @@ def generalised_advantages(
         return advantage, advantage
 
     return jax.lax.scan(accumulate, jnp.zeros_like(values[0]), (errors, decays), reverse=True)[1]
-
-
-def discounted_returns(
-    previous: jax.Array, rewards: jax.Array, done: jax.Array, discount: float
-) -> tuple[jax.Array, jax.Array]:
-    """Returns accumulated forwards, whose spread is the scale of the rewards.
-
-    previous: `[...]` returns so far of the running episodes.
-    rewards, done: `[T, ...]` of each step.
-    Gives the `[...]` returns to carry on with, 0 where an episode ended, and `[T, ...]` all.
-    """
-
-    def accumulate(before: jax.Array, inputs: tuple[jax.Array, jax.Array]):
-        reward, ended = inputs
-        after = discount * before + reward
-        return jnp.where(ended, 0.0, after), after
-
-    return jax.lax.scan(accumulate, previous, (rewards, done))

@@ -7,26 +7,33 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.env.repeat import Controller, corrected
-from vertiwm_jax.networks.policy import Actor, Critic, Gaussian
+from vertiwm_jax.networks.policy import (
+    ActionCritic,
+    Actor,
+    Critic,
+    Gaussian,
+    Squashed,
+    SquashedActor,
+)
 from vertiwm_jax.rl.normalise import RunningStatistics
 
 
 @struct.dataclass
 class MeanAction:
-    """The learned policy as it is used: always the mean of its Gaussian.
+    """The learned policy as it is used: always the mean of what it would draw.
 
     actor: the network, static; params: its weights.
     observations: statistics that its observations are normalised by.
     """
 
-    actor: Actor = struct.field(pytree_node=False)
+    actor: Actor | SquashedActor = struct.field(pytree_node=False)
     params: Any
     observations: RunningStatistics
 
     def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """`[..., O]` observations to `[..., A]` actions in [-1, 1]; the key is not used."""
         seen = self.observations.normalise(observation)
-        policy = cast(Gaussian, self.actor.apply(self.params, seen))
+        policy = cast(Gaussian | Squashed, self.actor.apply(self.params, seen))
         return jnp.clip(policy.mean, -1.0, 1.0)
 
 
@@ -47,6 +54,28 @@ class Value:
         """`[..., O]` observations to `[...]` values, in units of reward."""
         seen = self.observations.normalise(observation)
         return self.scale * cast(jax.Array, self.critic.apply(self.params, seen))
+
+
+@struct.dataclass
+class TwinValue:
+    """The same by two critics of actions, of which the lower one counts.
+
+    critic: the network, static; params: weights of both, with an axis for them.
+    policy: whose return it is; scale: `[]` of the critics' output.
+    """
+
+    critic: ActionCritic = struct.field(pytree_node=False)
+    params: Any
+    policy: MeanAction
+    scale: jax.Array
+
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """`[..., O]` observations to `[...]` values, in units of reward."""
+        seen = self.policy.observations.normalise(observation)
+        values = jax.vmap(self.critic.apply, (0, None, None))(
+            self.params, seen, self.policy(observation)
+        )
+        return self.scale * jnp.min(cast(jax.Array, values), axis=0)
 
 
 @struct.dataclass

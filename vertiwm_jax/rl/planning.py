@@ -11,7 +11,7 @@ from vertiwm_jax.dynamics import History, Params
 from vertiwm_jax.env.driver import Driver
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
 from vertiwm_jax.env.repeat import ActionRepeat, Controller, corrected
-from vertiwm_jax.rl.learned import MeanAction, Value
+from vertiwm_jax.rl.learned import MeanAction, TwinValue, Value
 from vertiwm_jax.world_model.choice import ModelName
 
 
@@ -64,7 +64,7 @@ class Planner(Driver):
     env: NavigationEnv = struct.field(pytree_node=False)
     dynamics: Params
     policy: MeanAction
-    value: Value
+    value: Value | TwinValue
     base: Controller | None = struct.field(pytree_node=False)
     interval: int = struct.field(pytree_node=False)
     discount: float = struct.field(pytree_node=False)

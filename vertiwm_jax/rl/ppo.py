@@ -5,9 +5,7 @@ object with two pure functions, `init` and `iterate`, over one `TrainState`; sev
 `vmap` of both.
 """
 
-import dataclasses
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
@@ -18,12 +16,13 @@ from flax import struct
 from gymnax.environments.environment import Environment
 
 from vertiwm_jax.networks.policy import Actor, Candidates, Critic, Gaussian
-from vertiwm_jax.rl.advantages import discounted_returns, generalised_advantages
+from vertiwm_jax.rl import environments
+from vertiwm_jax.rl.advantages import generalised_advantages
+from vertiwm_jax.rl.environments import Environments, Experience, Metrics, Outcomes
 from vertiwm_jax.rl.learned import MeanAction, Value
 from vertiwm_jax.rl.normalise import RunningStatistics
 
 Params = Any
-Metrics = dict[str, jax.Array]
 
 
 @dataclass(frozen=True)
@@ -68,22 +67,22 @@ class PPOConfig:
     """Whether rewards are divided by the running deviation of the discounted return."""
 
     def __post_init__(self):
-        if self.batch % self.minibatches:
-            divisor = math.gcd(self.minibatches, self.batch)
+        if self.collected % self.minibatches:
+            divisor = math.gcd(self.minibatches, self.collected)
             raise ValueError(
                 f"minibatches: {self.minibatches} does not divide num_envs * num_steps = "
-                f"{self.batch}; choose a divisor, for example {divisor}"
+                f"{self.collected}; choose a divisor, for example {divisor}"
             )
 
     @property
-    def batch(self) -> int:
+    def collected(self) -> int:
         """Transitions of one iteration."""
         return self.num_envs * self.num_steps
 
     @property
     def iterations(self) -> int:
         """Iterations of the whole training."""
-        return math.ceil(self.transitions / self.batch)
+        return math.ceil(self.transitions / self.collected)
 
     @property
     def learning_rate_schedule(self) -> optax.Schedule:
@@ -94,23 +93,6 @@ class PPOConfig:
             "linear": optax.linear_schedule(self.learning_rate, 0.0, steps),
             "cosine": optax.cosine_decay_schedule(self.learning_rate, steps),
         }[self.schedule]
-
-
-@struct.dataclass
-class Environments:
-    """N running environments.
-
-    state: the environment's own, leaves `[N, ...]`.
-    observation: `[N, O]` what the policy sees next, not normalised.
-    discounted_return: `[N]` of the running episode so far.
-    episode_return, episode_length: `[N]` undiscounted sum of rewards and steps so far.
-    """
-
-    state: Any
-    observation: jax.Array
-    discounted_return: jax.Array
-    episode_return: jax.Array
-    episode_length: jax.Array
 
 
 @struct.dataclass
@@ -137,18 +119,14 @@ class TrainState:
 
 @struct.dataclass
 class Transitions:
-    """Steps as collected, `[T, N]`; `observation` not normalised, `action` not clipped."""
+    """Steps as collected, `[T, N]`, and what the networks of that time made of them.
 
-    observation: jax.Array
-    action: jax.Array
+    log_prob: of the actions, which are not clipped; next_value: of what was seen after the step.
+    """
+
+    experience: Experience
     log_prob: jax.Array
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
     next_value: jax.Array
-    episode_return: jax.Array
-    episode_length: jax.Array
-    outcomes: Metrics
 
 
 @struct.dataclass
@@ -168,26 +146,24 @@ class PPO:
     """PPO on a gymnax environment with a flat observation and a bounded Box of actions.
 
     env: static; its parameters are an argument of every function.
-    outcomes: what to report of an episode, from the `info` of its last step: named scalars,
-        which are averaged over the episodes that end in an iteration.
+    outcomes: what to report, averaged over the episodes that end in an iteration.
     candidates: actions that the networks weigh against each other, if the task has such.
     """
 
     env: Environment
     config: PPOConfig
-    outcomes: Callable[[dict[str, jax.Array]], Metrics] = lambda info: {}
+    outcomes: Outcomes = lambda info: {}
     candidates: Candidates | None = None
 
     def init(self, env_params: Params, key: jax.Array) -> TrainState:
         """The state before the first iteration."""
         key, reset_key, actor_key, critic_key = jax.random.split(key, 4)
-        reset_keys = jax.random.split(reset_key, self.config.num_envs)
-        observation, state = jax.vmap(self.env.reset, (0, None))(reset_keys, env_params)
+        running = environments.start(self.env, env_params, self.config.num_envs, reset_key)
+        observation = running.observation
         params = {
             "actor": self._actor(env_params).init(actor_key, observation[0]),
             "critic": self._critic.init(critic_key, observation[0]),
         }
-        zeros = jnp.zeros(self.config.num_envs)
         return TrainState(
             iteration=jnp.zeros((), jnp.int32),
             key=key,
@@ -195,37 +171,34 @@ class PPO:
             optimiser=self._optimiser.init(params),
             observations=RunningStatistics.create(observation.shape[1:]),
             returns=RunningStatistics.create(()),
-            environments=Environments(state, observation, zeros, zeros, zeros),
+            environments=running,
         )
 
     def iterate(self, env_params: Params, state: TrainState) -> tuple[TrainState, Metrics]:
-        """Collects `batch` transitions and learns from them; jit it with `state` donated.
+        """Collects transitions and learns from them; jit it with `state` donated.
 
         The metrics are scalars. Those of episodes are means over the episodes that ended in
         this iteration, NaN if there were none; `finite` says whether all weights still are.
         """
         key, collect_key, update_key = jax.random.split(state.key, 3)
         with jax.named_scope("collect"):
-            environments, transitions = self._collect(env_params, state, collect_key)
+            running, transitions = self._collect(env_params, state, collect_key)
         with jax.named_scope("advantages"):
-            done = transitions.terminated | transitions.truncated
-            discounted_return, discounted = discounted_returns(
-                environments.discounted_return, transitions.reward, done, self.config.discount
-            )
+            experience = transitions.experience
             returns, observations = state.returns, state.observations
             if self.config.normalise_rewards:
-                returns = returns.update(discounted)
+                returns = returns.update(experience.discounted_return)
             if self.config.normalise_observations:
                 # From the next iteration on: within one, all are normalised alike.
-                observations = observations.update(transitions.observation)
+                observations = observations.update(experience.observation)
             batch = self._batch(state, returns, transitions)
         with jax.named_scope("update"):
             params, optimiser, losses = self._update(env_params, state, batch, update_key)
         finite = jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), (params, losses))
         metrics = {
             **losses,
-            **_episodes(transitions, done),
-            "reward": jnp.mean(transitions.reward),
+            **environments.episodes(experience),
+            "reward": jnp.mean(experience.reward),
             "explained_variance": 1 - jnp.var(batch.target - batch.value) / jnp.var(batch.target),
             "finite": jnp.all(jnp.stack(jax.tree.leaves(finite))),
         }
@@ -236,7 +209,7 @@ class PPO:
             optimiser=optimiser,
             observations=observations,
             returns=returns,
-            environments=dataclasses.replace(environments, discounted_return=discounted_return),
+            environments=running,
         )
         return state, metrics
 
@@ -245,8 +218,9 @@ class PPO:
         actor, params = self._actor(env_params), state.params["actor"]
         return MeanAction(actor, params, state.observations)
 
-    def value(self, state: TrainState) -> Value:
+    def value(self, env_params: Params, state: TrainState) -> Value:
         """What `state` expects of its policy."""
+        del env_params  # which other algorithms need
         params, scale = state.params["critic"], state.returns.std
         return Value(self._critic, params, state.observations, scale)
 
@@ -273,45 +247,18 @@ class PPO:
         self, env_params: Params, state: TrainState, key: jax.Array
     ) -> tuple[Environments, Transitions]:
         """T steps of N environments with the policy as it is."""
-        actor = self._actor(env_params)
-        space = self.env.action_space(env_params)
-        low, high = jnp.asarray(space.low), jnp.asarray(space.high)
-        step = jax.vmap(self.env.step, (0, 0, 0, None))
+        actor, config = self._actor(env_params), self.config
 
-        def advance(environments: Environments, key: jax.Array) -> tuple[Environments, Transitions]:
+        def advance(running: Environments, key: jax.Array) -> tuple[Environments, Transitions]:
             action_key, step_key = jax.random.split(key)
-            seen = state.observations.normalise(environments.observation)
+            seen = state.observations.normalise(running.observation)
             policy = cast(Gaussian, actor.apply(state.params["actor"], seen))
             action = policy.sample(action_key)
-            bounded = low + (high - low) * (jnp.clip(action, -1, 1) + 1) / 2
-            step_keys = jax.random.split(step_key, self.config.num_envs)
-            observation, env_state, reward, terminated, truncated, info = step(
-                step_keys, environments.state, bounded, env_params
+            running, experience, final = environments.step(
+                self.env, env_params, self.outcomes, config.discount, running, action, step_key
             )
-            final = state.observations.normalise(info["final_observation"])
-            episode_return = environments.episode_return + reward
-            episode_length = environments.episode_length + 1
-            transitions = Transitions(
-                observation=environments.observation,
-                action=action,
-                log_prob=policy.log_prob(action),
-                reward=reward,
-                terminated=terminated,
-                truncated=truncated,
-                next_value=self._value(state.params, final),
-                episode_return=episode_return,
-                episode_length=episode_length,
-                outcomes=jax.vmap(self.outcomes)(info),
-            )
-            done = terminated | truncated
-            environments = dataclasses.replace(
-                environments,
-                state=env_state,
-                observation=observation,
-                episode_return=jnp.where(done, 0.0, episode_return),
-                episode_length=jnp.where(done, 0.0, episode_length),
-            )
-            return environments, transitions
+            value = self._value(state.params, state.observations.normalise(final))
+            return running, Transitions(experience, policy.log_prob(action), value)
 
         keys = jax.random.split(key, self.config.num_steps)
         return jax.lax.scan(advance, state.environments, keys)
@@ -320,20 +267,21 @@ class PPO:
         self, state: TrainState, returns: RunningStatistics, transitions: Transitions
     ) -> Batch:
         """Transitions `[T, N]` to the flat batch `[T N]` of the loss."""
-        observation = state.observations.normalise(transitions.observation)
+        experience = transitions.experience
+        observation = state.observations.normalise(experience.observation)
         value = self._value(state.params, observation)
         advantage = generalised_advantages(
-            transitions.reward / returns.std,
+            experience.reward / returns.std,
             value,
             transitions.next_value,
-            transitions.terminated,
-            transitions.truncated,
+            experience.terminated,
+            experience.truncated,
             self.config.discount,
             self.config.trace,
         )
         batch = Batch(
             observation=observation,
-            action=transitions.action,
+            action=experience.action,
             log_prob=transitions.log_prob,
             value=value,
             advantage=advantage,
@@ -383,25 +331,10 @@ class PPO:
             updates, optimiser_state = optimiser.update(gradients, optimiser_state, params)
             return (optax.apply_updates(params, updates), optimiser_state), losses
 
-        shuffle = jax.vmap(lambda key: jax.random.permutation(key, config.batch))
+        shuffle = jax.vmap(lambda key: jax.random.permutation(key, config.collected))
         rows = shuffle(jax.random.split(key, config.epochs))
         rows = rows.reshape(config.epochs * config.minibatches, -1)
         (params, optimiser_state), losses = jax.lax.scan(
             descend, (state.params, state.optimiser), rows
         )
         return params, optimiser_state, jax.tree.map(jnp.mean, losses)
-
-
-def _episodes(transitions: Transitions, done: jax.Array) -> Metrics:
-    """Means over the episodes that ended, and how many did."""
-    count = jnp.sum(done)
-
-    def mean(x: jax.Array) -> jax.Array:
-        return jnp.sum(jnp.where(done, x, 0.0)) / count
-
-    return {
-        "episodes": count,
-        "episode_return": mean(transitions.episode_return),
-        "episode_length": mean(transitions.episode_length),
-        **jax.tree.map(mean, transitions.outcomes),
-    }

@@ -1,0 +1,141 @@
+"""SAC and TD3 on environments whose solutions are known."""
+
+import functools
+from dataclasses import replace
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rl.probes import Broken, Delayed, Endless, ProbeParams, Sign, Target
+
+from vertiwm_jax.rl.off_policy import OffPolicy
+from vertiwm_jax.rl.sac import SAC, SACConfig
+from vertiwm_jax.rl.td3 import TD3, TD3Config
+
+SETTINGS = {
+    "transitions": 4096,
+    "num_envs": 16,
+    "num_steps": 16,
+    "updates": 8,
+    "batch": 64,
+    "capacity": 4096,
+    "warm_up": 512,
+    "discount": 0.9,
+    "target_rate": 0.05,
+    "learning_rate": 2e-3,
+    "hidden": (64, 64),
+    "normalise_observations": False,
+    "normalise_rewards": False,
+}
+CONFIGS = {
+    "sac": SACConfig(**SETTINGS, initial_temperature=0.05, target_entropy=-2.0),
+    "td3": TD3Config(**SETTINGS),
+}
+TARGET = {"env": Target(), "normalise_rewards": True}
+each = pytest.mark.parametrize("name", CONFIGS)
+
+
+def algorithm(name, env, **settings):
+    config = replace(CONFIGS[name], **settings)
+    rule = SAC(config) if isinstance(config, SACConfig) else TD3(config)
+    return OffPolicy(env, rule, config, outcomes=lambda info: {"last": info["time"]})
+
+
+@functools.cache
+def compiled(algorithm):
+    chex.clear_trace_counter()  # chex counts by name
+    iterate = chex.assert_max_traces(algorithm.iterate, n=1)
+    return jax.jit(algorithm.init), jax.jit(iterate, donate_argnums=1)
+
+
+def train(algorithm, env_params=ProbeParams(), seed=0, iterations=None):
+    """The state and the metrics of the last of `iterations`, all by default."""
+    init, iterate = compiled(algorithm)
+    state, metrics = init(env_params, jax.random.key(seed)), {}
+    for _ in range(algorithm.config.iterations if iterations is None else iterations):
+        state, metrics = iterate(env_params, state)
+    return state, metrics
+
+
+def values(algorithm, state, *observations):
+    value = algorithm.value(ProbeParams(), state)
+    return np.asarray(value(jnp.array(observations, jnp.float32)[:, None]))
+
+
+@each
+def test_value_depends_on_the_observation(name):
+    sign = algorithm(name, Sign(), normalise_observations=True, normalise_rewards=True)
+    np.testing.assert_allclose(values(sign, train(sign)[0], -1.0, 1.0), [-1, 1], atol=0.1)
+
+
+@each
+def test_delayed_reward_is_discounted(name):
+    # The entropy that is to come is a part of SAC's values: here it is next to nothing.
+    quiet = {"initial_temperature": 1e-9, "target_entropy": -20.0} if name == "sac" else {}
+    delayed = algorithm(name, Delayed(), **quiet)
+    state, metrics = train(delayed)
+    np.testing.assert_allclose(values(delayed, state, 0.0, 1.0), [0.9, 1.0], atol=0.05)
+    assert float(metrics["last"]) == 2.0
+    assert float(metrics["episodes"]) == delayed.config.collected / 2
+
+
+@each
+def test_truncation_is_bootstrapped(name):
+    quiet = {"initial_temperature": 1e-9, "target_entropy": -20.0} if name == "sac" else {}
+    endless = algorithm(name, Endless(), target_rate=0.2, transitions=8192, **quiet)
+    state, metrics = train(endless, ProbeParams(max_steps_in_episode=5))
+    assert float(metrics["episode_length"]) == 5
+    np.testing.assert_allclose(values(endless, state, 0.0), 1 / (1 - 0.9), rtol=0.08)
+
+
+@each
+def test_policy_finds_the_action_that_depends_on_the_observation(name):
+    target = algorithm(name, **TARGET)
+    state, metrics = train(target)
+    # Actions 0 and 2 of [-2, 4] are -1/3 and 1/3 of [-1, 1].
+    actions = target.policy(ProbeParams(), state)(jnp.array([[-1.0], [1.0]]))
+    np.testing.assert_allclose(actions[:, 0], [-1 / 3, 1 / 3], atol=0.1)
+    if name == "sac":  # the temperature keeps the entropy asked for
+        assert abs(float(metrics["entropy"]) + 2) < 0.5
+        assert float(metrics["temperature"]) != pytest.approx(0.05, rel=0.2)
+
+
+@each
+def test_nothing_is_learned_while_warming_up(name):
+    target = algorithm(name, **TARGET)
+    first = compiled(target)[0](ProbeParams(), jax.random.key(0)).learner
+    one, metrics = train(target, iterations=1)
+    assert np.isnan(metrics["value_loss"]) and bool(metrics["finite"])
+    chex.assert_trees_all_equal(one.learner, first)
+    assert int(one.replay.filled) == 256
+    actions = np.asarray(one.replay.rows.action[:256])
+    assert actions.min() < -0.9 and actions.max() > 0.9 and abs(actions.mean()) < 0.15
+    two, metrics = train(target, iterations=2)  # whose last step has what is needed
+    assert np.isfinite(metrics["value_loss"])
+    if name == "td3":
+        assert int(two.learner.update) == target.config.updates
+
+
+def test_a_reward_that_is_no_number_is_noticed():
+    broken = algorithm("td3", Broken(), normalise_rewards=True)
+    _, metrics = train(broken, iterations=4)
+    assert not bool(metrics["finite"])
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"capacity": 100}, "capacity: expected a multiple of num_envs, 16, found 100"),
+        ({"warm_up": 8}, "warm_up: expected num_envs, 16, to capacity, 4096, found 8"),
+        ({"updates": 0}, "updates: expected at least 1, found 0"),
+    ],
+)
+def test_settings_that_cannot_be_are_named(settings, words):
+    with pytest.raises(ValueError, match=words):
+        SACConfig(**{**SETTINGS, **settings})
+    with pytest.raises(ValueError, match="policy_delay: expected at least 1"):
+        TD3Config(policy_delay=0)
+    with pytest.raises(ValueError, match="initial_temperature: expected more than 0"):
+        SACConfig(initial_temperature=0.0)

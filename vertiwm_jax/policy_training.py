@@ -1,0 +1,220 @@
+"""What the commands that train driving policies share: all but the algorithm."""
+
+import json
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Protocol
+
+import jax
+import numpy as np
+
+from vertiwm_jax import config as configuration
+from vertiwm_jax import runs
+from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.env.driver import Driver, Policy
+from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
+from vertiwm_jax.env.repeat import ActionRepeat, Controller
+from vertiwm_jax.evaluation import plots, report
+from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
+from vertiwm_jax.evaluation.report import Results, drive
+from vertiwm_jax.rl import ground, task
+from vertiwm_jax.rl.learned import Corrected, MeanAction, TwinValue, Value
+from vertiwm_jax.rl.loop import LoopConfig, restore, train
+from vertiwm_jax.rl.off_policy import OffPolicyConfig
+from vertiwm_jax.rl.planning import Planner, PlanningConfig
+from vertiwm_jax.rl.ppo import PPOConfig
+from vertiwm_jax.rl.task import TaskConfig
+from vertiwm_jax.runs import Run, RunError
+from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.training import Algorithm, TrainingError, TrainingInterrupted
+
+Rows = dict[str, Policy | Driver]
+
+
+class Learning(Algorithm[Any], Protocol):
+    """An algorithm that learns a policy from environments."""
+
+    def policy(self, env_params: NavigationParams, state: Any, /) -> MeanAction:
+        """What `state` has learned."""
+        ...
+
+    def value(self, env_params: NavigationParams, state: Any, /) -> Value | TwinValue:
+        """What `state` expects of its policy."""
+        ...
+
+
+CURVES = {
+    "episode_return": "return",
+    "success": "success",
+    "episode_length": "episode [steps]",
+    "entropy": "entropy [nats]",
+    "value_loss": "value loss",
+    "kl": "KL divergence",
+    "explained_variance": "explained variance",
+}
+
+
+@dataclass(frozen=True)
+class TrainConfig(TaskConfig, ABC):
+    """Settings of every such command; `name` is that of its algorithm's settings among them."""
+
+    name: ClassVar[str]
+
+    runs: Path = Path("runs")
+    """Folder in which the folder of this run is made."""
+    resume: Path | None = None
+    """Folder of an earlier run to go on with; what is set beside changes its configuration."""
+    compile_cache: Path | None = None
+    """Folder that keeps compiled programs for later runs."""
+    action_repeat: int = 4
+    """Steps of 0.1 s that an action is held while learning; `transitions` count actions."""
+    base: Literal["look ahead", "straight to goal", "none"] = "look ahead"
+    """The controller that the policy learns to correct; it acts at every step."""
+    planning: PlanningConfig | None = None
+    """How the policy plans in tests, besides driving as it is; learning does not need it."""
+    loop: LoopConfig = LoopConfig()
+    """Seeds and checkpoints."""
+
+    @property
+    def schedule(self) -> PPOConfig | OffPolicyConfig:
+        """The algorithm's settings."""
+        return getattr(self, self.name)
+
+    @abstractmethod
+    def algorithm(self, env: NavigationEnv) -> Learning:
+        """The algorithm on the task, as configured."""
+
+    def repeated(self, env: NavigationEnv) -> ActionRepeat:
+        """The task as algorithms see it."""
+        return ActionRepeat(env, self.action_repeat, _base(self))
+
+
+def main(kind: type[TrainConfig], argv: Sequence[str] | None = None) -> None:
+    """Runs the command; expected failures end in one line and a status that is not 0."""
+    program = f"python -m vertiwm_jax.{kind.name}"
+    config = configuration.parse_resumable(kind, kind.name, argv, program)
+    try:
+        run_folder = _train_and_report(config)
+    except TrainingInterrupted as stopped:
+        print(stopped)
+        sys.exit(130)
+    except KeyboardInterrupt:
+        print("stopped at once; go on from the newest checkpoint with --resume and the run folder")
+        sys.exit(130)
+    except (RunError, CheckpointError, TrainingError) as error:
+        sys.exit(f"error: {error}")
+    print(f"all of it is in {run_folder}")
+
+
+def learned(config: TrainConfig, terrain: TerrainMap, run: Path) -> Rows:
+    """The policies of the run in the folder `run`, one a seed; `CheckpointError` if none.
+
+    terrain: any worlds that tests can be drawn on.
+    """
+    tasks = ground.test_tasks(config.ground, terrain)
+    made = task.environment(config, config.model, terrain, tasks)
+    algorithm, params = config.algorithm(made.env), made.params
+    restored = restore(algorithm, params, run, config.loop.seeds)
+    if restored is None:
+        raise CheckpointError(f"{run}: expected checkpoints of a training, found none")
+    return _policies(config, algorithm, params, restored[1])
+
+
+def _base(config: TrainConfig) -> Controller | None:
+    return None if config.base == "none" else baselines(config.navigation)[config.base]
+
+
+def _policies(
+    config: TrainConfig, algorithm: Learning, params: NavigationParams, state: Any
+) -> Rows:
+    base, rows = _base(config), {}
+    for seed in range(config.loop.seeds):
+        of_seed = jax.tree.map(lambda x, seed=seed: x[seed], state)
+        policy, name = algorithm.policy(params, of_seed), config.name
+        if config.loop.seeds > 1:
+            name = f"{config.name}, seed {seed}"
+        rows[name] = Corrected(base, policy) if base else policy
+        if config.planning:
+            dynamics, weights = task.dynamics(config, config.planning.model)
+            rows[f"{name} with planning"] = Planner(
+                env=NavigationEnv(dynamics, config.navigation),
+                dynamics=weights,
+                policy=policy,
+                value=algorithm.value(params, of_seed),
+                base=base,
+                interval=config.action_repeat,
+                discount=config.schedule.discount,
+                config=config.planning,
+            )
+    return rows
+
+
+def _train_and_report(config: TrainConfig) -> Path:
+    if config.compile_cache:
+        jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
+    try:
+        training, test = task.environments(config)
+    except ValueError as error:  # what is wrong with the maps, or with the tasks on them
+        sys.exit(f"error: {error}")
+    env, params = training.env, training.params
+    algorithm, schedule, seeds = config.algorithm(env), config.schedule, config.loop.seeds
+    steps = schedule.collected * config.action_repeat
+    restored = restore(algorithm, params, config.resume, seeds) if config.resume else None
+    with _open(config, restored[0] if restored else 0) as run:
+        print(f"run folder {run.folder}", flush=True)
+        print(f"training in {config.model} on {params.terrain.worlds} worlds", flush=True)
+        key = config.key("training")
+        state = train(
+            algorithm, params, key, run, schedule.iterations, steps, config.loop, restored
+        )
+        policies = _policies(config, algorithm, params, state) | baselines(config.navigation)
+        driven = drive(test.env, test.params, policies, config.key("testing"))
+        _report(run, config, test.params, driven)
+    return run.folder
+
+
+def _open(config: TrainConfig, done: int) -> Run:
+    settings = replace(config, resume=None)
+    if config.resume is None:
+        return Run.create(config.runs, config.name, settings)
+    return Run.open(config.resume, done, settings)
+
+
+def _report(
+    run: Run, config: TrainConfig, test: NavigationParams, groups: Mapping[str, Results]
+) -> None:
+    table = report.markdown(groups, REFERENCE)
+    print(f"\n{table}\n")
+    runs.write_atomic(run.folder / "summary.md", table + "\n")
+    numbers = json.dumps(report.summary(groups, REFERENCE), indent=2)
+    runs.write_atomic(run.folder / "summary.json", numbers + "\n")
+    _draw(run, config, test, groups)
+
+
+def _draw(
+    run: Run, config: TrainConfig, test: NavigationParams, groups: Mapping[str, Results]
+) -> None:
+    """Learning curves, and for each difficulty a drive to a goal that is hard to reach."""
+    columns = runs.read_columns(run.folder)
+    labels = {name: label for name, label in CURVES.items() if name in columns}
+    figure = plots.learning_curves({config.name: columns}, "transitions", labels, "transitions")
+    plots.save(figure, run.folder / "learning_curves.png")
+    for name, results in groups.items():
+        reference = results[REFERENCE]
+        # The first task that the reference fails, better still one that a learned policy solves.
+        failed = ~np.asarray(reference.success)
+        solved = np.asarray(next(iter(results.values())).success)
+        hard = int(np.argmax(2 * failed + solved))
+        figure = plots.trajectories(
+            test.terrain,
+            int(reference.world[hard]),
+            {policy: result.path(hard) for policy, result in results.items()},
+            np.asarray(reference.goal[hard]),
+            config.navigation.goal_radius,
+            STEP_SECONDS,
+        )
+        plots.save(figure, run.folder / f"trajectories_{name}.png")

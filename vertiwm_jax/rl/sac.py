@@ -1,0 +1,122 @@
+"""Soft actor-critic: the value of an action counts how random the policy stays after it.
+
+Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", with two critics and a
+temperature that keeps the policy's entropy.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from vertiwm_jax.networks.policy import Squashed
+from vertiwm_jax.rl.environments import Metrics
+from vertiwm_jax.rl.off_policy import Networks, OffPolicyConfig, Params, Remembered
+
+
+@dataclass(frozen=True)
+class SACConfig(OffPolicyConfig):
+    """Settings of SAC."""
+
+    initial_temperature: float = 0.1
+    """Worth of a nat of entropy in the first policy, in units of (normalised) reward."""
+    target_entropy: float = -2.0
+    """Entropy, nats, of the actions in [-1, 1] that the temperature is adjusted to keep."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.initial_temperature <= 0:
+            raise ValueError(
+                f"initial_temperature: expected more than 0, found {self.initial_temperature}"
+            )
+
+
+@struct.dataclass
+class SACLearner:
+    """What SAC has learned; target: of both critics, behind them; the rest are Adam's states."""
+
+    actor: Params
+    critics: Params
+    target: Params
+    log_temperature: jax.Array
+    actor_optimiser: Any
+    critic_optimiser: Any
+    temperature_optimiser: Any
+
+
+@dataclass(frozen=True)
+class SAC:
+    """The `off_policy.Rule` of soft actor-critic."""
+
+    config: SACConfig
+
+    def init(self, networks: Networks, observation: jax.Array, key: jax.Array) -> SACLearner:
+        actor, critics = networks.init(key, observation)
+        log_temperature = jnp.log(jnp.float32(self.config.initial_temperature))
+        return SACLearner(
+            actor=actor,
+            critics=critics,
+            target=jax.tree.map(jnp.array, critics),
+            log_temperature=log_temperature,
+            actor_optimiser=networks.optimiser.init(actor),
+            critic_optimiser=networks.optimiser.init(critics),
+            temperature_optimiser=networks.optimiser.init(log_temperature),
+        )
+
+    def explore(
+        self, networks: Networks, learner: SACLearner, observation: jax.Array, key: jax.Array
+    ) -> jax.Array:
+        return _policy(networks, learner.actor, observation).sample(key)[0]
+
+    def learn(
+        self, networks: Networks, learner: SACLearner, batch: Remembered, key: jax.Array
+    ) -> tuple[SACLearner, Metrics]:
+        target_key, actor_key = jax.random.split(key)
+        temperature = jnp.exp(learner.log_temperature)
+        action, log_prob = _policy(networks, learner.actor, batch.following).sample(target_key)
+        later = jnp.min(networks.twins(learner.target, batch.following, action), axis=0)
+        later = jnp.where(batch.terminated, 0.0, later - temperature * log_prob)
+        target = batch.reward + self.config.discount * later
+
+        critics, critic_optimiser, loss = networks.fit_critics(
+            learner.critics, learner.critic_optimiser, batch, target
+        )
+
+        def actor_loss(actor: Params) -> tuple[jax.Array, jax.Array]:
+            action, log_prob = _policy(networks, actor, batch.observation).sample(actor_key)
+            value = jnp.min(networks.twins(critics, batch.observation, action), axis=0)
+            return jnp.mean(temperature * log_prob - value), -jnp.mean(log_prob)
+
+        (policy_loss, entropy), gradient = jax.value_and_grad(actor_loss, has_aux=True)(
+            learner.actor
+        )
+        actor, actor_optimiser = networks.descend(gradient, learner.actor_optimiser, learner.actor)
+        log_temperature, temperature_optimiser = networks.descend(
+            entropy - self.config.target_entropy,
+            learner.temperature_optimiser,
+            learner.log_temperature,
+        )
+        learner = replace(
+            learner,
+            actor=actor,
+            critics=critics,
+            target=optax.incremental_update(critics, learner.target, self.config.target_rate),
+            log_temperature=log_temperature,
+            actor_optimiser=actor_optimiser,
+            critic_optimiser=critic_optimiser,
+            temperature_optimiser=temperature_optimiser,
+        )
+        metrics = {
+            "value_loss": loss,
+            "policy_loss": policy_loss,
+            "entropy": entropy,
+            "temperature": temperature,
+        }
+        return learner, metrics
+
+
+def _policy(networks: Networks, actor: Params, observation: jax.Array) -> Squashed:
+    return cast(Squashed, networks.actor.apply(actor, observation))
