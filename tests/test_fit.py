@@ -125,6 +125,26 @@ def test_another_gate_for_the_specialists_of_an_earlier_run(run, fitted, capsys)
     assert (other / "learning_curves.png").stat().st_size > 10_000
 
 
+def test_a_fit_goes_on_from_a_model(run, fitted, folder, tmp_path):
+    further = fitted("--start", str(run / "model"))
+    stages = {path.name for path in further.iterdir() if path.is_dir()}
+    assert stages == {"nesam_rollouts", "transformer_rollouts", "gate", "model"}
+    before, after = (model.load(place / "model")[1] for place in (run, further))
+    for part in ("nesam", "transformer"):
+        old, new = getattr(before, part), getattr(after, part)
+        assert any(
+            not np.array_equal(x, y)
+            for x, y in zip(*map(jax.tree.leaves, (old.network, new.network)), strict=True)
+        )
+        chex.assert_trees_all_equal(old.replace(network=None), new.replace(network=None))
+    inputs = [(place / "nesam_rollouts" / "inputs.txt").read_text() for place in (run, further)]
+    assert inputs[0] != inputs[1]
+    other = ("--config", folder / "tiny.yaml", "--model.coefficients", "scalar")
+    message = refusal(fit.main, *other, "--start", run / "model", "--runs", tmp_path / "runs")
+    assert "coefficients='scalar'" in message and "coefficients='grouped'" in message
+    assert not (tmp_path / "runs").exists()
+
+
 def test_one_specialist_alone_is_fitted_and_compared(fitted, folder, tmp_path, capsys):
     parts = ["--model.parts", "transformer", "--model.terrain"]
     run = fitted(*parts, "none", "--name", "no_terrain")

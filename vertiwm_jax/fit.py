@@ -16,6 +16,7 @@ from vertiwm_jax.learning.pipeline import PipelineConfig
 from vertiwm_jax.runs import Run, RunError
 from vertiwm_jax.training import TrainingError, TrainingInterrupted
 from vertiwm_jax.world_model import model
+from vertiwm_jax.world_model.model import VertiWMParams
 
 ROLLOUTS = ("nesam_rollouts", "transformer_rollouts", "gate")
 """Stages that are drawn."""
@@ -43,6 +44,9 @@ class FitConfig(PipelineConfig):
     """Folder of an earlier run to go on with; stages that have ended are not repeated."""
     reuse: tuple[Path, ...] = ()
     """Folders of earlier runs, whose stages are taken over where their inputs are the same."""
+    start: Path | None = None
+    """Folder of a fitted model to go on from, or `pretrained`: it is fitted further by open-loop
+    predictions; its encoders and constants stay."""
     compile_cache: Path | None = None
     """Folder that keeps compiled programs for later runs."""
 
@@ -53,12 +57,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     if config.compile_cache:
         jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
     try:
-        settings = replace(config, resume=None)
+        settings, start = replace(config, resume=None), _start(config)
         with _open(config.resume, settings) as run:
             print(f"run folder {run.folder}", flush=True)
-            params = pipeline.fit(
-                config, config.data, jax.random.key(config.seed), run, config.reuse
-            )
+            key = jax.random.key(config.seed)
+            params = pipeline.fit(config, config.data, key, run, config.reuse, start)
             model.save(run.folder / "model", config.model, params)
             _draw(run)
     except TrainingInterrupted as stopped:
@@ -75,6 +78,17 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _configuration(argv: Sequence[str] | None) -> FitConfig:
     return configuration.parse_resumable(FitConfig, "fit_chrono", argv, "python -m vertiwm_jax.fit")
+
+
+def _start(config: FitConfig) -> VertiWMParams | None:
+    """The parameters to go on from; `ValueError` if they are of another model."""
+    if config.start is None:
+        return None
+    pretrained = config.start == Path("pretrained")
+    found, params = model.load(model.PRETRAINED if pretrained else config.start)
+    if found != config.model:
+        raise ValueError(f"{config.start}: expected {config.model}, found {found}")
+    return params
 
 
 def _open(resume: Path | None, settings: FitConfig) -> Run:

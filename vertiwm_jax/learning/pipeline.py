@@ -93,18 +93,23 @@ def fit(
     key: jax.Array,
     run: Run,
     reuse: Sequence[Path] = (),
+    start: VertiWMParams | None = None,
 ) -> VertiWMParams:
     """All stages of the configured parts; gives their parameters, and others untrained.
 
     folders: of drives, or of folders of drives named like `KINDS`; reuse: of other runs, whose
-    stages are taken over where their inputs are the same. Raises what `dataset.load`,
-    `WindowData.of` and `fitting.fit` raise.
+    stages are taken over where their inputs are the same; start: parameters to go on from, by
+    open-loop predictions alone. Raises what `dataset.load`, `WindowData.of` and `fitting.fit`
+    raise.
     """
-    pipeline = _Pipeline(config, tuple(folders), key, run, tuple(reuse))
+    pipeline = _Pipeline(config, tuple(folders), key, run, tuple(reuse), start)
     digests: list[str] = []
     built, parts = config.model, config.model.parts
-    constants = normalisation.measure(pipeline.load(KINDS, "train")[0])
-    params = built.init_params(key, chrono_like(hmmwv()), constants)
+    if start is None:
+        constants = normalisation.measure(pipeline.load(KINDS, "train")[0])
+        params = built.init_params(key, chrono_like(hmmwv()), constants)
+    else:
+        params = start
     if "nesam" in parts:
         second, digest = pipeline.specialist("nesam", built.nesam, params.nesam, config.nesam)
         params = replace(params, nesam=second)
@@ -127,6 +132,7 @@ class _Pipeline:
     key: jax.Array
     run: Run
     reuse: tuple[Path, ...]
+    start: VertiWMParams | None
 
     def specialist(
         self,
@@ -136,9 +142,9 @@ class _Pipeline:
         config: SpecialistConfig,
     ) -> tuple[Any, str]:
         """Its encoders, then for NeSAM what soils look like, then how it moves; and the digest."""
-        kinds, before = config.learns_from, ()
+        kinds, before = config.learns_from, self._begun
         drives = self._drives(kinds)
-        if params.encoders is not None:
+        if self.start is None and params.encoders is not None:
             patches = replace(self.config.patches, patches=specialist.exteroception.patches)
             places = cache(lambda: PatchData.of(patches, *drives()))
             problem = AutoencoderProblem(patches)
@@ -154,16 +160,17 @@ class _Pipeline:
                 looks, digest = self._fit(*stage, looks, places, before)
                 before = (*before, digest)
                 params = replace(params, soil=looks["soil"])
-        if isinstance(specialist, Nesam):
+        if self.start is None and isinstance(specialist, Nesam):
             params = nesam.calibrate(specialist, params, *self._sample(drives))
 
         data = cache(lambda: WindowData.of(self.config.windows, *drives()))
         deviation = tuple(params.normalisation.transition_deviation.tolist())
         single, rollouts = OneStep(specialist, deviation), OpenLoop(specialist, self.config.loss)
-        for part, objective, schedule in (
+        parts = [
             ("single_steps", single, config.single_steps),
             ("rollouts", rollouts, config.rollouts),
-        ):
+        ]
+        for part, objective, schedule in parts if self.start is None else parts[1:]:
             problem = WindowProblem(specialist, objective, self.config.windows)
             stage = f"{name}_{part}", problem, schedule, kinds
             params, digest = self._fit(*stage, params, data, before)
@@ -176,7 +183,8 @@ class _Pipeline:
         """The gate between two specialists, whose digests are given."""
         config = self.config.gate
         drives = self._drives(config.learns_from)
-        params = model.calibrate(verti_wm, params, *self._sample(drives))
+        if self.start is None:
+            params = model.calibrate(verti_wm, params, *self._sample(drives))
         objective = OpenLoop(verti_wm, self.config.loss, operator.attrgetter("coefficients"))
         problem = WindowProblem(verti_wm, objective, self.config.windows)
         data = cache(lambda: WindowData.of(self.config.windows, *drives()))
@@ -201,6 +209,11 @@ class _Pipeline:
         inputs = Inputs(problem, config, seed, tuple(kinds), drives, tuple(before))
         fitted = stages.fit(self.run, name, inputs, params, data, key, self.reuse)
         return fitted, inputs.digest
+
+    @property
+    def _begun(self) -> tuple[str, ...]:
+        """What the first stages know the parameters by that they go on from."""
+        return () if self.start is None else (stages.digest(self.start),)
 
     def _key(self, name: str) -> jax.Array:
         return jax.random.fold_in(self.key, zlib.crc32(name.encode()))

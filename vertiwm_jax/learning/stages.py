@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from vertiwm_jax import checkpoints, runs
 from vertiwm_jax.dynamics import Params
@@ -43,6 +44,15 @@ class Inputs:
     @property
     def digest(self) -> str:
         return hashlib.sha256(str(self).encode()).hexdigest()
+
+
+def digest(params: Params) -> str:
+    """What parameters are known by."""
+    sum_ = hashlib.sha256()
+    for path, leaf in jax.tree.leaves_with_path(params):
+        sum_.update(f"{jax.tree_util.keystr(path)} {leaf.shape} {leaf.dtype}".encode())
+        sum_.update(np.asarray(leaf).tobytes())
+    return sum_.hexdigest()
 
 
 def fit(
