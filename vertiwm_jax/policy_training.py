@@ -23,9 +23,8 @@ from vertiwm_jax.evaluation.report import Results, drive
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.learned import Corrected, MeanAction, TwinValue, Value
 from vertiwm_jax.rl.loop import LoopConfig, restore, train
-from vertiwm_jax.rl.off_policy import OffPolicyConfig
 from vertiwm_jax.rl.planning import Planner, PlanningConfig
-from vertiwm_jax.rl.ppo import PPOConfig
+from vertiwm_jax.rl.settings import LearningConfig
 from vertiwm_jax.rl.task import TaskConfig
 from vertiwm_jax.runs import Run, RunError
 from vertiwm_jax.state import STEP_SECONDS
@@ -80,7 +79,7 @@ class TrainConfig(TaskConfig, ABC):
     """Seeds and checkpoints."""
 
     @property
-    def schedule(self) -> PPOConfig | OffPolicyConfig:
+    def schedule(self) -> LearningConfig:
         """The algorithm's settings."""
         return getattr(self, self.name)
 

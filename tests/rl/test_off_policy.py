@@ -25,7 +25,9 @@ SETTINGS = {
     "discount": 0.9,
     "target_rate": 0.05,
     "learning_rate": 2e-3,
+    "max_gradient_norm": 10.0,
     "hidden": (64, 64),
+    "initial_log_std": -0.9,
     "normalise_observations": False,
     "normalise_rewards": False,
 }

@@ -20,6 +20,7 @@ from vertiwm_jax.rl.environments import Environments, Experience, Metrics, Outco
 from vertiwm_jax.rl.learned import MeanAction, TwinValue
 from vertiwm_jax.rl.normalise import RunningStatistics
 from vertiwm_jax.rl.replay import Replay
+from vertiwm_jax.rl.settings import LearningConfig
 
 Params = Any
 
@@ -38,15 +39,9 @@ Learner = TypeVar("Learner", bound=Twins)
 
 
 @dataclass(frozen=True)
-class OffPolicyConfig:
-    """Settings of an algorithm with a replay buffer."""
+class OffPolicyConfig(LearningConfig):
+    """Settings of an algorithm with a replay buffer; its learning rate is constant."""
 
-    transitions: int = 163_840
-    """Environment steps of the whole training, rounded up to whole iterations."""
-    num_envs: int = 128
-    """Environments run side by side."""
-    num_steps: int = 16
-    """Steps of each environment in an iteration."""
     updates: int = 8
     """Gradient steps after every step of all environments."""
     batch: int = 512
@@ -55,25 +50,12 @@ class OffPolicyConfig:
     """Transitions that the replay buffer holds; a multiple of num_envs."""
     warm_up: int = 8_192
     """Transitions by random actions before anything is learned."""
-    discount: float = 0.98
-    """Gamma."""
     target_rate: float = 0.005
     """Share of the critics that the target critics take over in a gradient step (tau)."""
-    learning_rate: float = 5e-4
-    """Of Adam, for all networks."""
-    max_gradient_norm: float = 10.0
-    """Gradients are clipped to this global norm."""
-    hidden: tuple[int, ...] = (64, 64)
-    """Widths of the layers of the actor and of the critics."""
-    initial_log_std: float = -0.9
-    """Log standard deviation of the first policy, in units of half the action range."""
-    normalise_observations: bool = True
-    """Whether observations are brought to zero mean and unit variance."""
-    normalise_rewards: bool = True
-    """Whether rewards are divided by the running deviation of the discounted return."""
 
     def __post_init__(self):
-        for name in ("num_envs", "num_steps", "updates", "batch", "transitions"):
+        super().__post_init__()
+        for name in ("updates", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
         if self.capacity < 1 or self.capacity % self.num_envs:
@@ -85,16 +67,6 @@ class OffPolicyConfig:
                 f"warm_up: expected num_envs, {self.num_envs}, to capacity, {self.capacity}, "
                 f"found {self.warm_up}"
             )
-
-    @property
-    def collected(self) -> int:
-        """Transitions of one iteration."""
-        return self.num_envs * self.num_steps
-
-    @property
-    def iterations(self) -> int:
-        """Iterations of the whole training."""
-        return math.ceil(self.transitions / self.collected)
 
 
 @struct.dataclass

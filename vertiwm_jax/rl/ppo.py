@@ -21,68 +21,40 @@ from vertiwm_jax.rl.advantages import generalised_advantages
 from vertiwm_jax.rl.environments import Environments, Experience, Metrics, Outcomes
 from vertiwm_jax.rl.learned import MeanAction, Value
 from vertiwm_jax.rl.normalise import RunningStatistics
+from vertiwm_jax.rl.settings import LearningConfig
 
 Params = Any
 
 
 @dataclass(frozen=True)
-class PPOConfig:
+class PPOConfig(LearningConfig):
     """Settings of PPO; the defaults suit the navigation task on the built-in simulator."""
 
-    transitions: int = 1_500_000
-    """Environment steps of the whole training, rounded up to whole iterations."""
-    num_envs: int = 256
-    """Environments run side by side."""
-    num_steps: int = 64
-    """Steps of each environment in an iteration."""
     epochs: int = 6
     """Passes over the data of an iteration."""
     minibatches: int = 8
     """Gradient steps in a pass; divides num_envs * num_steps."""
-    discount: float = 0.99
-    """Gamma."""
     trace: float = 0.95
     """Lambda of the generalised advantage estimator."""
     clip: float = 0.2
     """Largest change of the probability ratio that is rewarded."""
     value_clip: float | None = None
     """Largest change of a value in an iteration; none by default."""
-    learning_rate: float = 1e-3
-    """Of Adam, at the start."""
     schedule: Literal["constant", "linear", "cosine"] = "linear"
     """How the learning rate goes, to 0 at the end unless constant."""
-    max_gradient_norm: float = 0.5
-    """Gradients are clipped to this global norm."""
     value_weight: float = 0.5
     """Weight of the value loss."""
     entropy_weight: float = 0.0
     """Weight of the entropy bonus."""
-    hidden: tuple[int, ...] = (128, 128)
-    """Widths of the layers of the actor and of the critic."""
-    initial_log_std: float = -0.5
-    """Log standard deviation of the first policy, in units of half the action range."""
-    normalise_observations: bool = True
-    """Whether observations are brought to zero mean and unit variance."""
-    normalise_rewards: bool = True
-    """Whether rewards are divided by the running deviation of the discounted return."""
 
     def __post_init__(self):
+        super().__post_init__()
         if self.collected % self.minibatches:
             divisor = math.gcd(self.minibatches, self.collected)
             raise ValueError(
                 f"minibatches: {self.minibatches} does not divide num_envs * num_steps = "
                 f"{self.collected}; choose a divisor, for example {divisor}"
             )
-
-    @property
-    def collected(self) -> int:
-        """Transitions of one iteration."""
-        return self.num_envs * self.num_steps
-
-    @property
-    def iterations(self) -> int:
-        """Iterations of the whole training."""
-        return math.ceil(self.transitions / self.collected)
 
     @property
     def learning_rate_schedule(self) -> optax.Schedule:

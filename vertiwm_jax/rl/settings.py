@@ -1,0 +1,45 @@
+"""Settings that all algorithms have, with the defaults of PPO."""
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """How much is experienced, and what networks learn from it."""
+
+    transitions: int = 1_500_000
+    """Environment steps of the whole training, rounded up to whole iterations."""
+    num_envs: int = 256
+    """Environments run side by side."""
+    num_steps: int = 64
+    """Steps of each environment in an iteration."""
+    discount: float = 0.99
+    """Gamma."""
+    learning_rate: float = 1e-3
+    """Of Adam, at the start."""
+    max_gradient_norm: float = 0.5
+    """Gradients are clipped to this global norm."""
+    hidden: tuple[int, ...] = (128, 128)
+    """Widths of the layers of the actor and of each critic."""
+    initial_log_std: float = -0.5
+    """Log standard deviation of the first policy, in units of half the action range."""
+    normalise_observations: bool = True
+    """Whether observations are brought to zero mean and unit variance."""
+    normalise_rewards: bool = True
+    """Whether rewards are divided by the running deviation of the discounted return."""
+
+    def __post_init__(self):
+        for name in ("transitions", "num_envs", "num_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
+
+    @property
+    def collected(self) -> int:
+        """Transitions of one iteration."""
+        return self.num_envs * self.num_steps
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of the whole training."""
+        return math.ceil(self.transitions / self.collected)
