@@ -113,7 +113,7 @@ def test_resuming_is_as_if_never_stopped(run, train, monkeypatch):
 
 
 @pytest.mark.parametrize("door", [sac, pytest.param(td3, marks=pytest.mark.slow)])
-def test_other_algorithms_leave_the_same_and_resume(door, folder, tmp_path, monkeypatch):
+def test_other_algorithms_leave_the_same_and_resume(door, folder, tmp_path):
     name = door.__name__.split(".")[-1]
     settings = "{transitions: 192, num_envs: 8, num_steps: 8, updates: 1, batch: 8, capacity: 64, "
     settings += "warm_up: 64, hidden: [8]}"

@@ -156,7 +156,7 @@ def training(file: Path) -> TrainConfig:
     """The configuration of a training, by the algorithm whose settings are in the file."""
     text = file.read_text(encoding="utf-8") if file.is_file() else ""
     kinds = (PPOTraining, SACTraining, TD3Training)
-    named = [kind for kind in kinds if f"\n{kind.name}:" in text]
+    named = [kind for kind in kinds if f"\n{kind.name}:" in f"\n{text}"]
     return configuration.load(named[0] if named else PPOTraining, file)
 
 

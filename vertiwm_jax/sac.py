@@ -22,7 +22,7 @@ class SACTraining(TrainConfig):
     """The algorithm."""
 
     def algorithm(self, env: NavigationEnv) -> OffPolicy:
-        return OffPolicy(self.repeated(env), SAC(self.sac), self.sac, task.outcomes, ARCS)
+        return OffPolicy(self.repeated(env), SAC(self.sac), task.outcomes, ARCS)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

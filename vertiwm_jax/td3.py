@@ -22,7 +22,7 @@ class TD3Training(TrainConfig):
     """The algorithm."""
 
     def algorithm(self, env: NavigationEnv) -> OffPolicy:
-        return OffPolicy(self.repeated(env), TD3(self.td3), self.td3, task.outcomes, ARCS)
+        return OffPolicy(self.repeated(env), TD3(self.td3), task.outcomes, ARCS)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

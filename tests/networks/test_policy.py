@@ -142,6 +142,14 @@ def test_squashed_actor_starts_near_zero_with_the_deviation_asked_for():
     np.testing.assert_allclose(policy.gaussian.log_std, -0.9, atol=0.1)
 
 
+def test_a_certain_actor_draws_what_it_means():
+    actor = SquashedActor(actions=2, hidden=(16,), initial_log_std=None)
+    observation = jax.random.normal(jax.random.key(1), (64, 7))
+    policy = actor.apply(actor.init(jax.random.key(0), observation), observation)
+    drawn = jnp.tanh(policy.gaussian.sample(jax.random.key(2)))
+    np.testing.assert_array_equal(drawn, policy.mean)
+
+
 def test_action_critic_weighs_actions():
     critic = ActionCritic(hidden=(8,))
     observation, action = jnp.ones((3, 4, 5)), jnp.zeros((3, 4, 2))

@@ -27,12 +27,13 @@ SETTINGS = {
     "learning_rate": 2e-3,
     "max_gradient_norm": 10.0,
     "hidden": (64, 64),
-    "initial_log_std": -0.9,
     "normalise_observations": False,
     "normalise_rewards": False,
 }
 CONFIGS = {
-    "sac": SACConfig(**SETTINGS, initial_temperature=0.05, target_entropy=-2.0),
+    "sac": SACConfig(
+        **SETTINGS, initial_log_std=-0.9, initial_temperature=0.05, target_entropy=-2.0
+    ),
     "td3": TD3Config(**SETTINGS),
 }
 TARGET = {"env": Target(), "normalise_rewards": True}
@@ -42,7 +43,7 @@ each = pytest.mark.parametrize("name", CONFIGS)
 def algorithm(name, env, **settings):
     config = replace(CONFIGS[name], **settings)
     rule = SAC(config) if isinstance(config, SACConfig) else TD3(config)
-    return OffPolicy(env, rule, config, outcomes=lambda info: {"last": info["time"]})
+    return OffPolicy(env, rule, outcomes=lambda info: {"last": info["time"]})
 
 
 @functools.cache
@@ -52,10 +53,10 @@ def compiled(algorithm):
     return jax.jit(algorithm.init), jax.jit(iterate, donate_argnums=1)
 
 
-def train(algorithm, env_params=ProbeParams(), seed=0, iterations=None):
+def train(algorithm, env_params=ProbeParams(), iterations=None):
     """The state and the metrics of the last of `iterations`, all by default."""
     init, iterate = compiled(algorithm)
-    state, metrics = init(env_params, jax.random.key(seed)), {}
+    state, metrics = init(env_params, jax.random.key(0)), {}
     for _ in range(algorithm.config.iterations if iterations is None else iterations):
         state, metrics = iterate(env_params, state)
     return state, metrics

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -157,17 +158,21 @@ class SquashedActor(nn.Module):
     """`[..., O]` observations to `Squashed` Gaussians over actions, whose width is learned too.
 
     For algorithms that learn from what earlier policies did. With candidates the mean corrects
-    the mean of those attended to, before the tanh.
+    the mean of those attended to, before the tanh. Without an initial log standard deviation the
+    policy is certain: its Gaussians have no width.
     """
 
     actions: int
     hidden: Sequence[int]
-    initial_log_std: float
+    initial_log_std: float | None
     candidates: Candidates | None = None
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> Squashed:
         features, attended, hidden = _look(observation, self.hidden, self.candidates)
+        if self.initial_log_std is None:
+            mean = attended + MLP(hidden, self.actions, output_gain=0.01)(features)
+            return Squashed(Gaussian(mean, jnp.full(self.actions, -jnp.inf)))
         outputs = MLP(hidden, 2 * self.actions, output_gain=0.01)(features)
         mean, raw = jnp.split(outputs, 2, axis=-1)
         low, high = LOG_STD_BOUNDS
@@ -187,6 +192,14 @@ class ActionCritic(nn.Module):
         features, _, hidden = _look(observation, self.hidden, self.candidates)
         inputs = jnp.concatenate([features, action], axis=-1)
         return MLP(hidden, 1, output_gain=1.0)(inputs)[..., 0]
+
+
+def twin_values(
+    critic: ActionCritic, params: Any, observation: jax.Array, action: jax.Array
+) -> jax.Array:
+    """`[2, ...]` values of actions, by two critics whose weights have an axis for them."""
+    values = jax.vmap(critic.apply, (0, None, None))(params, observation, action)
+    return cast(jax.Array, values)
 
 
 def _look(

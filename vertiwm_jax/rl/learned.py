@@ -14,6 +14,7 @@ from vertiwm_jax.networks.policy import (
     Gaussian,
     Squashed,
     SquashedActor,
+    twin_values,
 )
 from vertiwm_jax.rl.normalise import RunningStatistics
 
@@ -72,10 +73,8 @@ class TwinValue:
     def __call__(self, observation: jax.Array) -> jax.Array:
         """`[..., O]` observations to `[...]` values, in units of reward."""
         seen = self.policy.observations.normalise(observation)
-        values = jax.vmap(self.critic.apply, (0, None, None))(
-            self.params, seen, self.policy(observation)
-        )
-        return self.scale * jnp.min(cast(jax.Array, values), axis=0)
+        values = twin_values(self.critic, self.params, seen, self.policy(observation))
+        return self.scale * jnp.min(values, axis=0)
 
 
 @struct.dataclass

@@ -5,8 +5,8 @@ batches from it. What a gradient step is, is a `Rule`.
 """
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Any, Generic, Protocol, TypeVar, cast
+from dataclasses import dataclass, replace
+from typing import Any, Generic, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import optax
 from flax import struct
 from gymnax.environments.environment import Environment
 
-from vertiwm_jax.networks.policy import ActionCritic, Candidates, SquashedActor
+from vertiwm_jax.networks.policy import ActionCritic, Candidates, SquashedActor, twin_values
 from vertiwm_jax.rl import environments
 from vertiwm_jax.rl.environments import Environments, Experience, Metrics, Outcomes
 from vertiwm_jax.rl.learned import MeanAction, TwinValue
@@ -90,12 +90,11 @@ class Networks:
 
     actor: SquashedActor
     critic: ActionCritic
-    optimiser: optax.GradientTransformation = field(compare=False)
+    optimiser: optax.GradientTransformation
 
     def twins(self, params: Params, observation: jax.Array, action: jax.Array) -> jax.Array:
-        """`[2, ...]` values of actions, by two critics whose weights have an axis for them."""
-        values = jax.vmap(self.critic.apply, (0, None, None))(params, observation, action)
-        return cast(jax.Array, values)
+        """`[2, ...]` values of actions, as both critics have them."""
+        return twin_values(self.critic, params, observation, action)
 
     def init(self, key: jax.Array, observation: jax.Array) -> tuple[Params, Params]:
         """Weights of the actor and of two critics; `observation` `[O]`."""
@@ -125,6 +124,15 @@ class Networks:
 
 class Rule(Protocol[Learner]):
     """How an algorithm explores and what it learns from a batch."""
+
+    @property
+    def config(self) -> OffPolicyConfig:
+        """The algorithm's settings."""
+        ...
+
+    def actor(self, actions: int, candidates: Candidates | None) -> SquashedActor:
+        """The network of the policy."""
+        ...
 
     def init(self, networks: Networks, observation: jax.Array, key: jax.Array) -> Learner:
         """The learner before the first batch; `observation` `[O]`."""
@@ -173,9 +181,13 @@ class OffPolicy(Generic[Learner]):
 
     env: Environment
     rule: Rule[Learner]
-    config: OffPolicyConfig
     outcomes: Outcomes = lambda info: {}
     candidates: Candidates | None = None
+
+    @property
+    def config(self) -> OffPolicyConfig:
+        """The rule's settings."""
+        return self.rule.config
 
     def init(self, env_params: Params, key: jax.Array) -> OffPolicyState[Learner]:
         """The state before the first iteration."""
@@ -245,7 +257,7 @@ class OffPolicy(Generic[Learner]):
         config = self.config
         actions = math.prod(self.env.action_space(env_params).shape)
         return Networks(
-            SquashedActor(actions, config.hidden, config.initial_log_std, self.candidates),
+            self.rule.actor(actions, self.candidates),
             ActionCritic(config.hidden, self.candidates),
             optax.chain(
                 optax.clip_by_global_norm(config.max_gradient_norm),

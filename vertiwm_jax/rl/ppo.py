@@ -30,6 +30,8 @@ Params = Any
 class PPOConfig(LearningConfig):
     """Settings of PPO; the defaults suit the navigation task on the built-in simulator."""
 
+    initial_log_std: float = -0.5
+    """Log standard deviation of the first policy, in units of half the action range."""
     epochs: int = 6
     """Passes over the data of an iteration."""
     minibatches: int = 8

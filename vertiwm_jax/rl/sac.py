@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from vertiwm_jax.networks.policy import Squashed
+from vertiwm_jax.networks.policy import Candidates, Squashed, SquashedActor
 from vertiwm_jax.rl.environments import Metrics
 from vertiwm_jax.rl.off_policy import Networks, OffPolicyConfig, Params, Remembered
 
@@ -21,6 +21,8 @@ from vertiwm_jax.rl.off_policy import Networks, OffPolicyConfig, Params, Remembe
 class SACConfig(OffPolicyConfig):
     """Settings of SAC."""
 
+    initial_log_std: float = -0.5
+    """Log standard deviation of the first policy, in units of half the action range."""
     initial_temperature: float = 0.1
     """Worth of a nat of entropy in the first policy, in units of (normalised) reward."""
     target_entropy: float = -2.0
@@ -52,6 +54,10 @@ class SAC:
     """The `off_policy.Rule` of soft actor-critic."""
 
     config: SACConfig
+
+    def actor(self, actions: int, candidates: Candidates | None) -> SquashedActor:
+        config = self.config
+        return SquashedActor(actions, config.hidden, config.initial_log_std, candidates)
 
     def init(self, networks: Networks, observation: jax.Array, key: jax.Array) -> SACLearner:
         actor, critics = networks.init(key, observation)

@@ -22,8 +22,6 @@ class LearningConfig:
     """Gradients are clipped to this global norm."""
     hidden: tuple[int, ...] = (128, 128)
     """Widths of the layers of the actor and of each critic."""
-    initial_log_std: float = -0.5
-    """Log standard deviation of the first policy, in units of half the action range."""
     normalise_observations: bool = True
     """Whether observations are brought to zero mean and unit variance."""
     normalise_rewards: bool = True

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from vertiwm_jax.networks.policy import Squashed
+from vertiwm_jax.networks.policy import Candidates, Squashed, SquashedActor
 from vertiwm_jax.rl.environments import Metrics
 from vertiwm_jax.rl.off_policy import Networks, OffPolicyConfig, Params, Remembered
 
 
 @dataclass(frozen=True)
 class TD3Config(OffPolicyConfig):
-    """Settings of TD3; its policy has no width, so `initial_log_std` only draws it."""
+    """Settings of TD3."""
 
     exploration: float = 0.3
     """Standard deviation of the noise on actions while learning, in units of half their range."""
@@ -53,6 +53,9 @@ class TD3:
     """The `off_policy.Rule` of TD3."""
 
     config: TD3Config
+
+    def actor(self, actions: int, candidates: Candidates | None) -> SquashedActor:
+        return SquashedActor(actions, self.config.hidden, None, candidates)
 
     def init(self, networks: Networks, observation: jax.Array, key: jax.Array) -> TD3Learner:
         actor, critics = networks.init(key, observation)
