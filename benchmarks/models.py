@@ -1,6 +1,7 @@
 """Steps of 0.1 s that each model takes in a second, by batch, on mixed ground, patches included."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import get_args
 
 import jax
@@ -16,12 +17,12 @@ from vertiwm_jax.terrain.worlds import WorldConfig
 from vertiwm_jax.world_model.choice import ModelName, choose
 
 BATCHES = (1, 20, 256, 1024)
-STEPS = 50
+STEPS = 20
 
 
-def rates(name: ModelName, batches: Sequence[int]) -> dict[str, Figures]:
+def rates(name: ModelName, weights: Path | None, batches: Sequence[int]) -> dict[str, Figures]:
     """Steps a second of one model, by batch."""
-    model, params = choose(name)
+    model, params = choose(name, weights)
     terrain = worlds.generate(jax.random.split(jax.random.key(0), 1), WorldConfig())
     vehicle = hmmwv()
 
@@ -43,7 +44,7 @@ def rates(name: ModelName, batches: Sequence[int]) -> dict[str, Figures]:
         xy = jax.random.uniform(keys[2], (batch, 2), minval=-40.0, maxval=40.0)
         yaw = jax.random.uniform(keys[3], (batch,), minval=-jnp.pi, maxval=jnp.pi)
         many = jax.jit(jax.vmap(drive, in_axes=(None, 0, 0, 0)))
-        figures = measure(many, params, xy, yaw, commands, repeats=5)
+        figures = measure(many, params, xy, yaw, commands, repeats=3)
         rate = batch * STEPS / figures["median_s"]
         results[f"{name}, batch {batch}"] = {"steps_per_s": rate, **figures}
     return results
@@ -52,11 +53,12 @@ def rates(name: ModelName, batches: Sequence[int]) -> dict[str, Figures]:
 def main() -> None:
     arguments = parser(__doc__)
     arguments.add_argument("--models", nargs="+", default=get_args(ModelName))
+    arguments.add_argument("--weights", type=Path, help="folder of a fitted model, e.g. RUN/model")
     arguments.add_argument("--batches", nargs="+", type=int, default=BATCHES)
     chosen = arguments.parse_args()
     results: dict[str, Figures] = {}
     for name in chosen.models:
-        results |= rates(name, chosen.batches)
+        results |= rates(name, chosen.weights, chosen.batches)
     report("models", results, chosen.json)
 
 

@@ -29,6 +29,7 @@ from vertiwm_jax.sac import SACTraining
 from vertiwm_jax.td3 import TD3Training
 from vertiwm_jax.terrain.worlds import Difficulty
 from vertiwm_jax.world_model.choice import ModelName, choose, fitted
+from vertiwm_jax.world_model.nesam import SoilSource
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class Prediction:
     """The models."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
+    soil: SoilSource | None = None
+    """Where the models have soils from, if not from where they had them when they were fitted."""
     compare: tuple[Path, ...] = ()
     """Run folders of `fit`, of which each part is a row, beside the paper's figures for it."""
     split: dataset.Split = "test"
@@ -108,7 +111,7 @@ def _predict(command: Prediction) -> None:
     except ValueError as error:  # what is wrong with the drives, or with their maps
         sys.exit(f"error: {error}")
     models: dict[str, tuple[Dynamics, Params]] = {
-        **{name: choose(name, command.weights) for name in command.models},
+        **{name: choose(name, command.weights, command.soil) for name in command.models},
         **_compared(command.compare),
         "kinematic bicycle": (KinematicBicycle(), bicycle_of(hmmwv())),
         "constant velocity": (ConstantVelocity(), None),

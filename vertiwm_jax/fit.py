@@ -1,6 +1,5 @@
 """`python -m vertiwm_jax.fit`: fit Verti-WM to recorded drives, all stages of it."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,12 +8,11 @@ import jax
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
-from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.learning import pipeline
 from vertiwm_jax.learning.pipeline import PipelineConfig
-from vertiwm_jax.runs import Run, RunError
-from vertiwm_jax.training import TrainingError, TrainingInterrupted
+from vertiwm_jax.runs import Run
+from vertiwm_jax.training import failures_in_one_line
 from vertiwm_jax.world_model import model
 from vertiwm_jax.world_model.model import VertiWMParams
 
@@ -56,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     config = _configuration(argv)
     if config.compile_cache:
         jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
-    try:
+    with failures_in_one_line(ValueError):
         settings, start = replace(config, resume=None), _start(config)
         with _open(config.resume, settings) as run:
             print(f"run folder {run.folder}", flush=True)
@@ -64,14 +62,6 @@ def main(argv: Sequence[str] | None = None) -> None:
             params = pipeline.fit(config, config.data, key, run, config.reuse, start)
             model.save(run.folder / "model", config.model, params)
             _draw(run)
-    except TrainingInterrupted as stopped:
-        print(stopped)
-        sys.exit(130)
-    except KeyboardInterrupt:
-        print("stopped at once; go on from the newest checkpoint with --resume and the run folder")
-        sys.exit(130)
-    except (RunError, CheckpointError, TrainingError, ValueError) as error:
-        sys.exit(f"error: {error}")
     print(f"the model is in {run.folder / 'model'}; how well it predicts:")
     print(f"python -m vertiwm_jax.evaluate prediction --compare {run.folder} --data DRIVES")
 

@@ -26,10 +26,10 @@ from vertiwm_jax.rl.loop import LoopConfig, restore, train
 from vertiwm_jax.rl.planning import Planner, PlanningConfig
 from vertiwm_jax.rl.settings import LearningConfig
 from vertiwm_jax.rl.task import TaskConfig
-from vertiwm_jax.runs import Run, RunError
+from vertiwm_jax.runs import Run
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.training import Algorithm, TrainingError, TrainingInterrupted
+from vertiwm_jax.training import Algorithm, failures_in_one_line
 
 Rows = dict[str, Policy | Driver]
 
@@ -96,16 +96,8 @@ def main(kind: type[TrainConfig], argv: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
     program = f"python -m vertiwm_jax.{kind.name}"
     config = configuration.parse_resumable(kind, kind.name, argv, program)
-    try:
+    with failures_in_one_line():
         run_folder = _train_and_report(config)
-    except TrainingInterrupted as stopped:
-        print(stopped)
-        sys.exit(130)
-    except KeyboardInterrupt:
-        print("stopped at once; go on from the newest checkpoint with --resume and the run folder")
-        sys.exit(130)
-    except (RunError, CheckpointError, TrainingError) as error:
-        sys.exit(f"error: {error}")
     print(f"all of it is in {run_folder}")
 
 

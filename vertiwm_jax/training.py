@@ -2,6 +2,7 @@
 
 import contextlib
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +14,8 @@ import jax
 import numpy as np
 
 from vertiwm_jax import checkpoints
-from vertiwm_jax.runs import Run
+from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.runs import Run, RunError
 
 State = TypeVar("State")
 
@@ -60,6 +62,21 @@ class TrainingError(RuntimeError):
 
 class TrainingInterrupted(RuntimeError):
     """The user stopped the training; the message says where it was saved."""
+
+
+@contextlib.contextmanager
+def failures_in_one_line(*expected: type[Exception]) -> Iterator[None]:
+    """Ends the command at failures of trainings and at those `expected`, with a status not 0."""
+    try:
+        yield
+    except TrainingInterrupted as stopped:
+        print(stopped)
+        sys.exit(130)
+    except KeyboardInterrupt:
+        print("stopped at once; go on from the newest checkpoint with --resume and the run folder")
+        sys.exit(130)
+    except (RunError, CheckpointError, TrainingError, *expected) as error:
+        sys.exit(f"error: {error}")
 
 
 def restore(algorithm: Algorithm[State], data: Any, folder: Path) -> tuple[int, State] | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from vertiwm_jax import runs
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.evaluation import error_sources, plots, prediction, prediction_plots
+from vertiwm_jax.evaluation import error_sources, plots, prediction, prediction_plots, wheels
 from vertiwm_jax.evaluation.prediction import BATCH, MEASURES, PredictionErrors, TestWindows
 from vertiwm_jax.learning.rollouts import open_loop
 from vertiwm_jax.learning.windows import GROUNDS, Windows
@@ -42,6 +42,9 @@ def write(
     tables = [prediction.format_table(rows, measure, horizon) for measure in MEASURES]
     tables.append(f"Position error of {name}, where it is\n")
     tables.append(error_sources.format_shares(error_sources.locate(test, error)))
+    if turning := wheels.compare(best, params, test):
+        tables.append(f"Wheels of {name} after {horizon} steps, beside those recorded\n")
+        tables.append(wheels.format_table(turning))
     runs.write_atomic(folder / "prediction.md", "\n\n".join(tables) + "\n")
     runs.write_atomic(folder / "prediction.csv", _csv(rows))
 

@@ -1,5 +1,6 @@
 """Every model of this package by name, for commands that let their users choose."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -8,29 +9,39 @@ from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.world_model import model
+from vertiwm_jax.world_model.nesam import SoilSource
 
 ModelName = Literal["builtin", "transformer", "nesam", "vertiwm"]
 """The simulator, which has learned nothing; either specialist; both of them fused."""
 
 
-def choose(name: ModelName, weights: Path | None = None) -> tuple[Dynamics, Params]:
+def choose(
+    name: ModelName, weights: Path | None = None, soil: SoilSource | None = None
+) -> tuple[Dynamics, Params]:
     """The model and its parameters, for Chrono's HMMWV.
 
-    weights: folder of a fitted model; the one that comes with the package by default. Raises what
-    `model.load` raises, and `CheckpointError` when it holds other parts alone.
+    weights: folder of a fitted model; the one that comes with the package by default. soil: where
+    NeSAM has soils from, if not from where it had them when it was fitted. Raises what `model.load`
+    raises, and `CheckpointError` when it holds other parts alone.
     """
     if name == "builtin":
         return Simulator(), chrono_like(hmmwv())
     folder = weights or model.PRETRAINED
-    found = fitted(folder)
+    found = fitted(folder, soil)
     if name not in found:
         raise CheckpointError(f"{folder}: expected {name}, found {' and '.join(found)} alone")
     return found[name]
 
 
-def fitted(folder: Path) -> dict[ModelName, tuple[Dynamics, Params]]:
-    """The models that are fitted in a folder, and their parameters; raises like `model.load`."""
+def fitted(
+    folder: Path, soil: SoilSource | None = None
+) -> dict[ModelName, tuple[Dynamics, Params]]:
+    """The models that are fitted in a folder, and their parameters; `soil` as in `choose`.
+
+    Raises like `model.load`.
+    """
     config, params = model.load(folder)
+    config = replace(config, soil=soil or config.soil)
     models: dict[ModelName, tuple[Dynamics, Params]] = {}
     if "gate" in config.parts:
         models["vertiwm"] = (config.build(), params)

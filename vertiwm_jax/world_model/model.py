@@ -18,7 +18,7 @@ from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import fusion
 from vertiwm_jax.world_model.fusion import CONTEXT_SIZE, POSITION_AND_YAW, GateTerrain, Proposal
-from vertiwm_jax.world_model.nesam import Nesam
+from vertiwm_jax.world_model.nesam import Nesam, SoilSource
 from vertiwm_jax.world_model.normalisation import Normalisation
 from vertiwm_jax.world_model.perception import Perception, Specialist
 from vertiwm_jax.world_model.sizes import BASE, PAPER
@@ -85,7 +85,7 @@ class ModelConfig:
     """Of both specialists' networks."""
     terrain: Literal["patches", "indicator", "none"] = "patches"
     """What the Transformer is told of the ground; less than patches only to compare with."""
-    soil: Literal["map", "predicted"] = "map"
+    soil: SoilSource = "map"
     """Whether NeSAM uses the soils of the map or predicts them from what the ground looks like."""
     gate_terrain: GateTerrain = "mean"
     """What the gate reads of the ground."""

@@ -22,6 +22,7 @@ from vertiwm_jax.world_model.specialist_network import SpecialistNetwork
 from vertiwm_jax.world_model.step_features import StepFeatures
 
 _SOIL = SoilPredictor()
+SoilSource = Literal["map", "predicted"]
 NUDGE = 0.05
 """Change of velocities, m/s and rad/s, by which `calibrate` measures how physics answers."""
 
@@ -81,7 +82,7 @@ class Nesam:
     size: TransformerSize = BASE
     residual: bool = True
     gradient: Literal["exact", "mean"] = "mean"
-    soil: Literal["map", "predicted"] = "map"
+    soil: SoilSource = "map"
     exteroception: Exteroception = Exteroception()
     simulator: Simulator = Simulator()
 

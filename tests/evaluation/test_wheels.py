@@ -1,0 +1,76 @@
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import chex
+import jax
+import numpy as np
+import pytest
+
+from vertiwm_jax.evaluation import wheels
+from vertiwm_jax.evaluation.prediction import TestWindows
+from vertiwm_jax.learning import dataset
+from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.mechanics.kinematic import ConstantVelocity
+from vertiwm_jax.state import VehicleState
+from vertiwm_jax.world_model.choice import choose
+from vertiwm_jax.world_model.model import ModelConfig
+
+OPEN = Path(__file__).parents[2] / "data" / "open"
+
+
+@pytest.fixture(scope="module")
+def test(tmp_path_factory):
+    """Windows on soil of one world, with all that is recorded of wheels."""
+    folder = tmp_path_factory.mktemp("drives")
+    for kind in ("deformable", "maps"):
+        (folder / kind).mkdir()
+        shutil.copy(OPEN / kind / "deformable_001.npz", folder / kind)
+    drives, terrain = dataset.load(folder / "deformable", "test")
+    found = TestWindows.of(drives, terrain, context=8, horizon=4, stride=40)
+    assert np.all(np.asarray(found.windows.ground) == 1)
+    return found
+
+
+@pytest.fixture(scope="module")
+def simulated(test):
+    return wheels.compare(*choose("builtin"), test)
+
+
+def test_wheels_of_the_simulator_go_with_those_recorded(test, simulated):
+    sinkage, speed, force = simulated
+    assert (sinkage.quantity, speed.quantity, force.quantity) == (
+        "sinkage, mm", "speed, rad/s", "force, kN",
+    )  # fmt: skip
+    assert all(x.ground == "deformable" for x in simulated)
+    depth = 1000 * np.maximum(test.windows.auxiliary.wheel_sinkage[:, -1], 0)
+    assert sinkage.recorded == pytest.approx(depth.mean(), rel=1e-4)
+    assert all(x.error < 0.6 * x.recorded and x.correlation > 0.7 for x in simulated)
+    assert 4 < force.recorded < 9  # A quarter of the vehicle's weight, about.
+    table = wheels.format_table(simulated)
+    assert table.count("\n") == 4 and f"| {sinkage.error:.3g} |" in table
+
+
+def test_every_model_with_physics_tells_of_its_wheels_and_others_do_not(test, simulated):
+    config = ModelConfig()
+    params = config.init_params(jax.random.key(0), choose("builtin")[1])
+    # Untrained, NeSAM is physics as it is.
+    found = wheels.compare(config.nesam, params.nesam, test)
+    assert len(found) == 3
+    np.testing.assert_allclose([x.error for x in found], [x.error for x in simulated], rtol=1e-3)
+    terrain = test.terrain.select(0)
+    state = VehicleState.from_vector(test.windows.state[0, 0])
+    fused = wheels.modelled(config.build().init(params, terrain, state))
+    assert fused is not None
+    chex.assert_trees_all_equal(
+        fused, wheels.modelled(config.nesam.init(params.nesam, terrain, state))
+    )
+    assert wheels.compare(ConstantVelocity(), None, test) == []
+
+
+def test_what_was_not_recorded_is_not_compared(test, simulated):
+    speed = test.windows.auxiliary.wheel_omega
+    some = replace(test, windows=test.windows.replace(auxiliary=Auxiliary(wheel_omega=speed)))
+    assert wheels.compare(*choose("builtin"), some) == [simulated[1]]
+    none = replace(test, windows=test.windows.replace(auxiliary=Auxiliary()))
+    assert wheels.compare(*choose("builtin"), none) == []
