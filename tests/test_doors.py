@@ -25,7 +25,7 @@ from vertiwm_jax.world_model.model import ModelConfig
 
 GRASS = 3
 TINY = """
-ground: {train_worlds: 2, held_out_worlds: 2, starts: 8, pairs: 2}
+ground: {train_worlds: 2, suites: [easy, obstacles], suite_worlds: 1, starts: 8, pairs: 2}
 navigation: {horizon_seconds: 3, settle_steps: 2}
 simulator: {substeps: 1}
 action_repeat: 2
@@ -72,7 +72,7 @@ def test_a_run_leaves_all_that_was_promised(run, folder):
     left = {path.name.split(".tfevents")[0] for path in run.iterdir()}
     assert left >= {
         "config.yaml", "metrics.jsonl", "events.out", "checkpoints", "learning_curves.png",
-        "summary.md", "summary.json",
+        "summary.md", "summary.json", "episodes.csv",
     }  # fmt: skip
     lines = runs.read_metrics(run)
     assert [line["step"] for line in lines] == [1, 2, 3, 4]
@@ -81,11 +81,12 @@ def test_a_run_leaves_all_that_was_promised(run, folder):
     assert all(np.isfinite(line["policy_loss"]) for line in lines)
     assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["2", "4"]
     summary = json.loads((run / "summary.json").read_text())
-    for difficulty, rows in summary.items():
+    assert list(summary) == ["easy", "obstacles"]
+    for suite, rows in summary.items():
         policies = "ppo", "ppo with planning", "look ahead", "straight to goal", "random"
         assert tuple(rows) == policies
-        assert (run / f"trajectories_{difficulty}.png").is_file()
-        assert f"**{difficulty}**" in (run / "summary.md").read_text()
+        assert (run / f"trajectories_{suite}.png").is_file()
+        assert f"**{suite}**" in (run / "summary.md").read_text()
     assert sum(rows["ppo"]["tasks"] for rows in summary.values()) == 4
     asked = configuration.load(PPOTraining, folder / "tiny.yaml")
     assert configuration.load(PPOTraining, run / "config.yaml").ppo == asked.ppo
@@ -128,8 +129,8 @@ def test_other_algorithms_leave_the_same_and_resume(door, folder, tmp_path):
         train("--resume", str(stopped))
     assert numbers(stopped) == numbers(run)
     chex.assert_trees_all_equal(learned(stopped), learned(run))
-    evaluate.main(["navigation", "--policy", str(run), "--json", str(tmp_path / "found.json")])
-    found = json.loads((tmp_path / "found.json").read_text())
+    evaluate.main(["navigation", "--policy", str(run), "--output", str(tmp_path / "found")])
+    found = json.loads((tmp_path / "found" / "summary.json").read_text())
     assert found == json.loads((run / "summary.json").read_text())
     assert all(name in rows for rows in found.values())
 
@@ -187,10 +188,9 @@ def test_runs_that_cannot_be_are_named(run, folder, tmp_path):
 
 
 def test_a_run_is_evaluated_as_at_its_end(run, tmp_path, capsys):
-    evaluate.main(["navigation", "--policy", str(run), "--json", str(tmp_path / "found.json")])
-    assert json.loads((tmp_path / "found.json").read_text()) == json.loads(
-        (run / "summary.json").read_text()
-    )
+    evaluate.main(["navigation", "--policy", str(run), "--output", str(tmp_path)])
+    for name in ("summary.json", "episodes.csv"):
+        assert (tmp_path / name).read_text() == (run / name).read_text()
     assert (run / "summary.md").read_text() in capsys.readouterr().out
 
 
@@ -201,9 +201,9 @@ def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch
     assert "driving 4 tasks on 2 worlds" in capsys.readouterr().out
     # The usual worlds are many.
     monkeypatch.setattr(configuration, "default_config", lambda name: run / "config.yaml")
-    evaluate.main([*navigate, "straight", "--difficulties", "extreme"])
+    evaluate.main([*navigate, "straight", "--suites", "hard", "--seed", "7"])
     text = capsys.readouterr().out
-    assert "**extreme**" in text and "| straight to goal" in text
+    assert "**hard**" in text and "| straight to goal" in text
     assert "random" not in text and "Solved of" not in text
     evaluate.main([*navigate, "random"])
     assert "| random" in capsys.readouterr().out

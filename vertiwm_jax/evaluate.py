@@ -1,6 +1,5 @@
 """`python -m vertiwm_jax.evaluate`: how well a model predicts, and how well a policy drives."""
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +9,7 @@ from typing import Literal
 import tyro
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import policy_training, runs
+from vertiwm_jax import policy_training
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.dynamics import Dynamics, Params
@@ -24,10 +23,10 @@ from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.policy_training import TrainConfig
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import ground, task
+from vertiwm_jax.rl.ground import Suite
 from vertiwm_jax.runs import RunError
 from vertiwm_jax.sac import SACTraining
 from vertiwm_jax.td3 import TD3Training
-from vertiwm_jax.terrain.worlds import Difficulty
 from vertiwm_jax.world_model.choice import ModelName, choose, fitted
 from vertiwm_jax.world_model.nesam import SoilSource
 
@@ -69,23 +68,35 @@ class Prediction:
 class Navigation:
     """Success, time, roll and pitch of a policy, on worlds that it was not trained on.
 
-    The worlds are those held out of the policy's training, unless others are asked for.
+    The worlds and tasks are those held out of the policy's training, unless others are asked for.
     """
 
     policy: Literal["straight", "random"] | Path
     """Folder of a training run, or a controller that has learned nothing."""
+    simulator: ModelName = "builtin"
+    """What moves the vehicle."""
     worlds: Path | None = None
     """A Verti-Bench checkout or a folder of .npz maps, to drive on all of them."""
-    difficulties: tuple[Difficulty, ...] = ()
-    """Draws new procedural worlds of these difficulties."""
+    obstacles: bool = False
+    """Whether the rocks and trees of these maps stand there."""
+    suites: tuple[Suite, ...] = ()
+    """Kinds of procedural worlds; all three by default."""
+    suite_worlds: int | None = None
+    """How many worlds of each suite; as many as after training by default."""
     pairs: int | None = None
     """Tasks in a world; as many as after training by default."""
-    json: Path | None = None
-    """File to write the numbers to."""
+    seed: int | None = None
+    """Draws other procedural worlds than those held out."""
+    output: Path | None = None
+    """Folder for tables, all episodes and pictures."""
 
     def __post_init__(self):
-        if self.worlds and self.difficulties:
-            raise ValueError("difficulties: are drawn, give them or worlds")
+        drawn = ("suites", "suite_worlds", "seed")
+        found = [name for name in drawn if getattr(self, name) not in ((), None)]
+        if self.worlds and found:
+            raise ValueError(f"{found[0]}: is of procedural worlds, give it or worlds")
+        if self.obstacles and not self.worlds:
+            raise ValueError("obstacles: is of given worlds; procedural ones are a suite")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -138,9 +149,9 @@ def _navigate(command: Navigation) -> None:
     file = run / "config.yaml" if run else configuration.default_config("ppo")
     try:
         config = _adapted(training(file), command)
-        grounds, maps = config.ground, command.worlds
-        terrain = ground.load(grounds, maps) if maps else task.held_out(config)
-        test = task.test_environment(config, terrain)
+        maps = command.worlds
+        terrain = ground.load(config.ground, maps) if maps else task.held_out(config)
+        test = task.test_environment(config, terrain, command.simulator)
     except ValueError as error:  # what is wrong with configuration, maps, or tasks on them
         sys.exit(f"error: {error}")
     policies = baselines(config.navigation)
@@ -150,9 +161,9 @@ def _navigate(command: Navigation) -> None:
         policies = {REFERENCE: policies[REFERENCE]}
     groups = report.drive(test.env, test.params, policies, config.key("testing"))
     print(f"\n{report.markdown(groups, REFERENCE)}")
-    if command.json:
-        numbers = json.dumps(report.summary(groups, REFERENCE), indent=2)
-        runs.write_atomic(command.json, numbers + "\n")
+    if command.output:
+        radius = config.navigation.goal_radius
+        report.write(command.output, groups, REFERENCE, terrain, radius)
 
 
 def training(file: Path) -> TrainConfig:
@@ -165,11 +176,15 @@ def training(file: Path) -> TrainConfig:
 
 def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:
     """The configuration of a training with the ground that the command asks for."""
-    grounds = replace(config.ground, pairs=command.pairs or config.ground.pairs)
-    if not command.difficulties:
-        return replace(config, ground=grounds)
-    testing = replace(grounds.testing, difficulties=command.difficulties)
-    return replace(config, worlds=None, ground=replace(grounds, testing=testing))
+    asked = {name: getattr(command, name) for name in ("suites", "suite_worlds", "pairs")}
+    grounds = replace(config.ground, **{name: value for name, value in asked.items() if value})
+    if command.worlds:
+        grounds = replace(grounds, obstacles=command.obstacles)
+    if command.suites:
+        config = replace(config, worlds=None)
+    if command.seed is not None:
+        config = replace(config, worlds=None, seed=command.seed)
+    return replace(config, ground=grounds)
 
 
 if __name__ == "__main__":

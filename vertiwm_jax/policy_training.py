@@ -1,15 +1,13 @@
 """What the commands that train driving policies share: all but the algorithm."""
 
-import json
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol
 
 import jax
-import numpy as np
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
@@ -19,7 +17,6 @@ from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
 from vertiwm_jax.env.repeat import ActionRepeat, Controller
 from vertiwm_jax.evaluation import plots, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
-from vertiwm_jax.evaluation.report import Results, drive
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.learned import Corrected, MeanAction, TwinValue, Value
 from vertiwm_jax.rl.loop import LoopConfig, restore, train
@@ -27,7 +24,6 @@ from vertiwm_jax.rl.planning import Planner, PlanningConfig
 from vertiwm_jax.rl.settings import LearningConfig
 from vertiwm_jax.rl.task import TaskConfig
 from vertiwm_jax.runs import Run
-from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.training import Algorithm, failures_in_one_line
 
@@ -163,8 +159,11 @@ def _train_and_report(config: TrainConfig) -> Path:
             algorithm, params, key, run, schedule.iterations, steps, config.loop, restored
         )
         policies = _policies(config, algorithm, params, state) | baselines(config.navigation)
-        driven = drive(test.env, test.params, policies, config.key("testing"))
-        _report(run, config, test.params, driven)
+        _draw_learning(run, config)
+        groups = report.drive(test.env, test.params, policies, config.key("testing"))
+        print(f"\n{report.markdown(groups, REFERENCE)}\n")
+        ground_driven, radius = test.params.terrain, config.navigation.goal_radius
+        report.write(run.folder, groups, REFERENCE, ground_driven, radius)
     return run.folder
 
 
@@ -175,37 +174,8 @@ def _open(config: TrainConfig, done: int) -> Run:
     return Run.open(config.resume, done, settings)
 
 
-def _report(
-    run: Run, config: TrainConfig, test: NavigationParams, groups: Mapping[str, Results]
-) -> None:
-    table = report.markdown(groups, REFERENCE)
-    print(f"\n{table}\n")
-    runs.write_atomic(run.folder / "summary.md", table + "\n")
-    numbers = json.dumps(report.summary(groups, REFERENCE), indent=2)
-    runs.write_atomic(run.folder / "summary.json", numbers + "\n")
-    _draw(run, config, test, groups)
-
-
-def _draw(
-    run: Run, config: TrainConfig, test: NavigationParams, groups: Mapping[str, Results]
-) -> None:
-    """Learning curves, and for each difficulty a drive to a goal that is hard to reach."""
+def _draw_learning(run: Run, config: TrainConfig) -> None:
     columns = runs.read_columns(run.folder)
     labels = {name: label for name, label in CURVES.items() if name in columns}
     figure = plots.learning_curves({config.name: columns}, "transitions", labels, "transitions")
     plots.save(figure, run.folder / "learning_curves.png")
-    for name, results in groups.items():
-        reference = results[REFERENCE]
-        # The first task that the reference fails, better still one that a learned policy solves.
-        failed = ~np.asarray(reference.success)
-        solved = np.asarray(next(iter(results.values())).success)
-        hard = int(np.argmax(2 * failed + solved))
-        figure = plots.trajectories(
-            test.terrain,
-            int(reference.world[hard]),
-            {policy: result.path(hard) for policy, result in results.items()},
-            np.asarray(reference.goal[hard]),
-            config.navigation.goal_radius,
-            STEP_SECONDS,
-        )
-        plots.save(figure, run.folder / f"trajectories_{name}.png")

@@ -8,6 +8,7 @@ from vertiwm_jax.env import observation
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain import obstacles
 
 CHASSIS = Chassis()
 observe = jax.jit(observation.observe, static_argnums=1)
@@ -157,9 +158,16 @@ def test_obstacles_soil_and_the_edge_are_seen():
         goal,
         jnp.zeros(2),
     )
-    raised, *_ = observation.arcs_ahead(seen) - np.stack(observation.arcs_ahead(bare))
-    # 2 m over the scale of 2 m, if all four wheels stand on it.
-    assert set(np.round(np.ravel(raised), 4)) == {0.0, 0.25, 0.5, 0.75, 1.0}
+    change = np.stack(observation.arcs_ahead(seen)) - np.stack(observation.arcs_ahead(bare))
+    wall = np.asarray(observation.arcs_ahead(seen)[1]) == 7.5
+    np.testing.assert_array_equal((change != 0).any(axis=0), wall)
+    assert not change[[0, 2, 3, 4]].any()
+    # A wall where the vehicle, and a margin of 0.3 m, would touch the obstacle.
+    place, heading = observation.poses_ahead(CHASSIS)
+    poses = place[1:] + np.array([4.0, 3.0]), jnp.asarray(heading[1:])
+    hit = obstacles.collides(terrain, *poses, CHASSIS.length + 0.6, CHASSIS.width + 0.6)
+    np.testing.assert_array_equal(wall.ravel(), hit)
+    assert 3 < hit.sum() < len(hit) - 3
 
     friction, sinkage = np.asarray(seen)[CLASSES].reshape(-1, 2).T
     snow = sinkage > 0
@@ -212,5 +220,5 @@ def test_the_edge_of_the_map_is_a_wall():
     found = observe(terrain, CHASSIS, state, jnp.zeros(3), jnp.zeros(2))
     crown = np.ravel(observation.arcs_ahead(found)[1])
     outside = observation.poses_ahead(CHASSIS)[0][1:, 0] > 5.0
-    np.testing.assert_allclose(crown[outside], 3.0, rtol=1e-6)
+    np.testing.assert_allclose(crown[outside], 7.5, rtol=1e-6)
     assert np.all(crown[~outside] < 2.0) and 0 < outside.sum() < outside.size

@@ -1,3 +1,4 @@
+import csv
 import json
 
 import jax
@@ -8,8 +9,9 @@ import pytest
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation import report
 from vertiwm_jax.evaluation.navigation import NavigationResult
+from vertiwm_jax.terrain import map as terrain_map
 
-DIFFICULTY = ["high", "low", "high"]
+SUITES = ["hard", "easy", "hard"]
 WORLD = [0, 0, 1, 1, 2, 2]
 
 
@@ -39,34 +41,34 @@ def groups():
         "straight": result([0, 1, 1, 1, 0, 0]),
         "random": result([0, 0, 0, 0, 0, 0]),
     }
-    return report.by_difficulty(results, DIFFICULTY)
+    return report.by_suite(results, SUITES)
 
 
-def test_episodes_go_to_the_difficulty_of_their_world(groups):
-    assert list(groups) == ["high", "low"]
-    for name, worlds in (("high", [0, 0, 2, 2]), ("low", [1, 1])):
+def test_episodes_go_to_the_suite_of_their_world(groups):
+    assert list(groups) == ["hard", "easy"]
+    for name, worlds in (("hard", [0, 0, 2, 2]), ("easy", [1, 1])):
         for episodes in groups[name].values():
             assert episodes.world.tolist() == worlds
             assert {len(leaf) for leaf in jax.tree.leaves(episodes)} == {len(worlds)}
-    assert groups["high"]["learned"].steps.tolist() == [10, 20, 50, 60]
+    assert groups["hard"]["learned"].steps.tolist() == [10, 20, 50, 60]
 
 
 def test_summary_is_json_and_counts_rescues(groups):
     summary = json.loads(json.dumps(report.summary(groups, "straight"), allow_nan=False))
-    high, low = summary["high"], summary["low"]
-    assert (high["learned"]["successes"], high["straight"]["successes"]) == (3, 1)
+    hard, easy = summary["hard"], summary["easy"]
+    assert (hard["learned"]["successes"], hard["straight"]["successes"]) == (3, 1)
     # Of the tasks 0, 4 and 5 that the reference fails, the learned policy solves 0 and 4.
-    assert high["learned"]["solved_of_reference_failures"] == 2
-    assert low["learned"]["solved_of_reference_failures"] == 0
-    assert low["straight"]["solved_of_reference_failures"] == 0
-    assert high["learned"]["seconds"] == pytest.approx(np.mean([1, 2, 5]), rel=1e-5)
-    assert high["random"]["seconds"] is None
-    assert high["random"]["endings"] == {"stuck": 4}
+    assert hard["learned"]["solved_of_reference_failures"] == 2
+    assert easy["learned"]["solved_of_reference_failures"] == 0
+    assert easy["straight"]["solved_of_reference_failures"] == 0
+    assert hard["learned"]["seconds"] == pytest.approx(np.mean([1, 2, 5]), rel=1e-5)
+    assert hard["random"]["seconds"] is None
+    assert hard["random"]["endings"] == {"stuck": 4}
 
 
-def test_markdown_has_a_table_for_each_difficulty(groups):
+def test_markdown_has_a_table_for_each_suite(groups):
     text = report.markdown(groups, "straight")
-    assert text.index("**high**") < text.index("**low**")
+    assert text.index("**hard**") < text.index("**easy**")
     assert "Solved of the 3 tasks that straight fails: learned 2, random 0" in text
     assert "Solved of the 0 tasks that straight fails: learned 0, random 0" in text
     rows = [line for line in text.splitlines() if line.startswith("| learned ")]
@@ -74,5 +76,19 @@ def test_markdown_has_a_table_for_each_difficulty(groups):
 
 
 def test_the_reference_alone_is_compared_with_nothing(groups):
-    text = report.markdown({"low": {"straight": groups["low"]["straight"]}}, "straight")
+    text = report.markdown({"easy": {"straight": groups["easy"]["straight"]}}, "straight")
     assert "| straight " in text and "Solved" not in text
+
+
+def test_everything_is_written(groups, tmp_path):
+    terrain = terrain_map.stack([terrain_map.build(np.zeros((65, 65)), np.zeros((8, 8), int))] * 3)
+    report.write(tmp_path / "new", groups, "straight", terrain, 8.0)
+    left = {path.name for path in (tmp_path / "new").iterdir()}
+    pictures = {"trajectories_hard.png", "trajectories_easy.png"}
+    assert left == {"summary.md", "summary.json", "episodes.csv", *pictures}
+    with (tmp_path / "new" / "episodes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3 * 6
+    first = rows[0]
+    assert (first["suite"], first["policy"], first["world"]) == ("hard", "learned", "0")
+    assert (first["ending"], first["seconds"], first["driven_m"]) == ("goal", "1.0", "5.0")

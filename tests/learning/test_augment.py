@@ -66,10 +66,11 @@ def test_the_mirrored_ground_is_the_ground_at_the_mirrored_place(both):
 
 def test_obstacles_are_mirrored_and_unused_ones_stay_unused(both):
     xy = points()
-    here = obstacles.height_above_ground(both.select(jnp.int32(1)), xy)
-    there = obstacles.height_above_ground(both.select(jnp.int32(3)), across(xy))
+    yaw = jnp.zeros(xy.shape[:-1])
+    here = obstacles.collides(both.select(jnp.int32(1)), xy, yaw, 0.1, 0.2)
+    there = obstacles.collides(both.select(jnp.int32(3)), across(xy), yaw, 0.2, 0.1)
     np.testing.assert_array_equal(here, there)
-    assert (np.asarray(here) > 0).sum() > 10
+    assert here.sum() > 10
     np.testing.assert_array_equal(both.obstacles[:, 2], 0)
 
 

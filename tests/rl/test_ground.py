@@ -12,7 +12,7 @@ from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
 
 GRASS = 3
-CONFIG = GroundConfig(train_worlds=3, held_out_worlds=3, starts=6, pairs=4)
+CONFIG = GroundConfig(train_worlds=3, suite_worlds=2, starts=6, pairs=4)
 
 
 def plane(slope_deg: float, size: int = 17) -> terrain_map.TerrainMap:
@@ -28,14 +28,32 @@ def procedural():
 
 def test_procedural_worlds_are_never_both_trained_and_tested_on(procedural):
     train, held_out = (np.asarray(terrain.elevation) for terrain in procedural)
-    assert train.shape == held_out.shape == (3, 129, 129)
+    assert train.shape == (3, 129, 129) and held_out.shape == (6, 129, 129)
     assert not any(np.allclose(a, b) for a in train for b in held_out)
 
 
 def test_procedural_worlds_have_the_difficulty_they_were_drawn_with(procedural):
     train, held_out = procedural
     assert ground.difficulties(train) == ["mid", "high", "mid"]
-    assert ground.difficulties(held_out) == ["low", "mid", "high"]
+    assert ground.difficulties(held_out) == ["low", "mid", "high", "high", "low", "mid"]
+    assert ground.suites(held_out) == ["easy"] * 2 + ["hard"] * 2 + ["obstacles"] * 2
+
+
+def test_a_suite_alone_has_the_same_worlds(procedural):
+    alone = replace(CONFIG, suites=("obstacles",))
+    _, terrain = ground.grounds(alone, None, jax.random.key(0))
+    np.testing.assert_array_equal(terrain.elevation, procedural[1].elevation[4:])
+    np.testing.assert_array_equal(terrain.obstacles, procedural[1].obstacles[4:])
+    with pytest.raises(ValueError, match="suites: expected some of easy, hard, obstacles"):
+        replace(CONFIG, suites=())
+
+
+def test_the_suite_of_a_map_is_that_of_its_slope_and_obstacles():
+    rock = np.array([[2, 2, 1, 1, 1]], np.float32)
+    flat, steep = plane(0), plane(20)
+    both = [replace(terrain, obstacles=rock[None]) for terrain in (flat, steep)]
+    terrain = terrain_map.stack([flat, steep, *both])
+    assert ground.suites(terrain) == ["easy", "hard", "obstacles", "hard, obstacles"]
 
 
 def test_every_so_manieth_map_is_held_out(tmp_path):
@@ -63,7 +81,7 @@ def test_difficulty_is_the_nearest_preset():
 def test_tasks_cross_every_world_and_start_anywhere(procedural):
     train, held_out = procedural
     across = ground.test_tasks(CONFIG, held_out)
-    assert np.bincount(np.asarray(across.world)).tolist() == [4, 4, 4]
+    assert np.bincount(np.asarray(across.world)).tolist() == [4] * 6
     np.testing.assert_allclose(np.linalg.norm(across.start, axis=-1), 60, rtol=1e-5)
     np.testing.assert_allclose(across.goal, -np.asarray(across.start), atol=1e-3)
     tasks = ground.training_tasks(CONFIG, train, Chassis(), jax.random.key(1))

@@ -53,18 +53,10 @@ def test_collides_where_the_areas_overlap():
     np.testing.assert_array_equal(found, area > 0)
 
 
-def test_height_is_that_of_the_tallest_box_over_a_point():
-    xy = jnp.array([[3.0, 4.0], [1.2, 4.0], [4.0, 6.5], [-6.0, -3.0], [0.0, 0.0], [3.0, 5.5]])
-    found = obstacles.height_above_ground(build(BOXES), xy)
-    np.testing.assert_allclose(found, [3.8, 3.8, 5, 1, 0, 0])
-    assert obstacles.height_above_ground(build(BOXES), jnp.array([4.2, 4.0])) == 5
-
-
 def test_no_obstacles_no_collision():
     terrain = build(np.zeros((0, 5)))
     xy = jnp.zeros((2, 3, 2))
     assert not obstacles.collides(terrain, xy, jnp.zeros((2, 3)), 4, 2).any()
-    assert not obstacles.height_above_ground(terrain, xy).any()
 
 
 def test_a_nan_pose_touches_nothing():

@@ -30,7 +30,8 @@ _SLOPE_SCALE = 0.4
 _TWIST_SCALE = 0.2
 _CROWN_SCALE = 0.2  # m
 _SINKAGE_SCALE = 0.1  # m
-_WALL = 0.6  # m, crown that stands for the edge of the map
+_WALL = 1.5  # m, crown that stands for obstacles and the edge of the map
+_CLEARANCE = 0.3  # m that is kept from obstacles
 
 GOAL = slice(8, 11)
 """Where the observation holds the distance over 50 m and the cosine and sine of the bearing."""
@@ -104,9 +105,10 @@ def observe(
 
     In order: roll, pitch; v_body; omega_body; distance to the goal, cosine and sine of its
     bearing; the last action; what the ground would do to the vehicle here and at places on nine
-    arcs up to six wheelbases long, obstacles included (mean height under the wheels against now;
-    crown between them, which the belly meets, with a wall beyond the edge of the map; rise; bank;
-    twist, which lifts wheels); friction and plate sinkage at some of the places, -1 off the map.
+    arcs up to six wheelbases long (mean height under the wheels against now; crown between them,
+    which the belly meets, and a wall where an obstacle or the edge of the map would be hit; rise;
+    bank; twist, which lifts wheels); friction and plate sinkage at some of the places, -1 off
+    the map.
 
     goal: `[3]` m; action: `[2]` in [-1, 1].
     """
@@ -133,10 +135,13 @@ def observe(
     left = np.stack([-np.sin(heading), np.cos(heading)], axis=-1) * chassis.track / 2
     corners = (forward + left, forward - left, -forward + left, -forward - left)
     xy = at(np.stack([place, *(place + corner for corner in corners)]))
-    middle, fl, fr, rl, rr = query.height(terrain, xy) + obstacles.height_above_ground(terrain, xy)
+    middle, fl, fr, rl, rr = query.height(terrain, xy)
     mean = (fl + fr + rl + rr) / 4
+    size = chassis.length + 2 * _CLEARANCE, chassis.width + 2 * _CLEARANCE
+    blocked = obstacles.collides(terrain, at(place), yaw + heading, *size)
     # Heights repeat beyond the edge of the map, which would look like the best of roads.
-    crown = jnp.where(edge_distance(terrain, at(place)) >= 0, middle - mean, _WALL)
+    blocked |= edge_distance(terrain, at(place)) < 0
+    crown = jnp.where(blocked, _WALL, middle - mean)
     ground = (
         (mean - state.position[2]) / _HEIGHT_SCALE,
         crown / _CROWN_SCALE,

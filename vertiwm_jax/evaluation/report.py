@@ -1,14 +1,22 @@
-"""The closing table: policies side by side, by difficulty of the ground."""
+"""What a test of policies leaves behind: tables by suite, every episode, and pictures."""
 
+import csv
 import dataclasses
+import io
+import json
+import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from vertiwm_jax import runs
 from vertiwm_jax.env.driver import Driver, Policy
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
+from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.evaluation import plots
 from vertiwm_jax.evaluation.navigation import (
     NavigationResult,
     Summary,
@@ -16,6 +24,8 @@ from vertiwm_jax.evaluation.navigation import (
     format_table,
 )
 from vertiwm_jax.rl import ground
+from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain.map import TerrainMap
 
 Results = Mapping[str, NavigationResult]
 
@@ -26,22 +36,49 @@ def drive(
     policies: Mapping[str, Policy | Driver],
     key: jax.Array,
 ) -> dict[str, Results]:
-    """Drives all tasks of the pool with each policy; the results by difficulty of the ground."""
+    """Drives all tasks of the pool with each policy; the results by suite."""
     print(f"driving {params.pool_size} tasks on {params.terrain.worlds} worlds ...", flush=True)
     results = {name: evaluate(env, params, policy, key) for name, policy in policies.items()}
-    return by_difficulty(results, ground.difficulties(params.terrain))
+    return by_suite(results, ground.suites(params.terrain))
 
 
-def by_difficulty(results: Results, difficulty: Sequence[str]) -> dict[str, Results]:
-    """Splits the episodes of each policy by the `difficulty` `[W]` of their world."""
+def by_suite(results: Results, suites: Sequence[str]) -> dict[str, Results]:
+    """Splits the episodes of each policy by the suite of their world, of `suites` `[W]`."""
     groups = {}
-    for name in dict.fromkeys(difficulty):
-        worlds = [world for world, found in enumerate(difficulty) if found == name]
+    for name in dict.fromkeys(suites):
+        worlds = [world for world, found in enumerate(suites) if found == name]
         groups[name] = {
             policy: jax.tree.map(lambda x, rows=np.isin(result.world, worlds): x[rows], result)
             for policy, result in results.items()
         }
     return groups
+
+
+def write(
+    folder: Path,
+    groups: Mapping[str, Results],
+    reference: str,
+    terrain: TerrainMap,
+    goal_radius: float,
+) -> None:
+    """`summary.md`, `summary.json`, `episodes.csv`, and a picture of a hard task of each suite."""
+    folder.mkdir(parents=True, exist_ok=True)
+    runs.write_atomic(folder / "summary.md", markdown(groups, reference) + "\n")
+    numbers = json.dumps(summary(groups, reference), indent=2)
+    runs.write_atomic(folder / "summary.json", numbers + "\n")
+    runs.write_atomic(folder / "episodes.csv", _csv(groups))
+    for name, results in groups.items():
+        hard = _hard_task(results, reference)
+        first = next(iter(results.values()))
+        figure = plots.trajectories(
+            terrain,
+            int(first.world[hard]),
+            {policy: result.path(hard) for policy, result in results.items()},
+            np.asarray(first.goal[hard]),
+            goal_radius,
+            STEP_SECONDS,
+        )
+        plots.save(figure, folder / f"trajectories_{name.replace(', ', '_')}.png")
 
 
 def markdown(groups: Mapping[str, Results], reference: str) -> str:
@@ -61,6 +98,41 @@ def summary(groups: Mapping[str, Results], reference: str) -> dict[str, Any]:
         }
         for name, results in groups.items()
     }
+
+
+def _csv(groups: Mapping[str, Results]) -> str:
+    """One line for each episode."""
+    lines = [
+        {
+            "suite": suite,
+            "policy": policy,
+            "world": int(result.world[i]),
+            "goal_x": float(result.goal[i, 0]),
+            "goal_y": float(result.goal[i, 1]),
+            "ending": Ending(int(result.ending[i])).name.lower(),
+            "seconds": round(float(result.seconds[i]), 1),
+            "abs_roll_deg": math.degrees(float(result.abs_roll[i])),
+            "abs_pitch_deg": math.degrees(float(result.abs_pitch[i])),
+            "driven_m": float(result.driven[i]),
+            "final_distance_m": float(result.final_distance[i]),
+        }
+        for suite, results in groups.items()
+        for policy, device in results.items()
+        for result in [jax.device_get(device)]
+        for i in range(len(result.ending))
+    ]
+    table = io.StringIO()
+    writer = csv.DictWriter(table, list(lines[0]))
+    writer.writeheader()
+    writer.writerows(lines)
+    return table.getvalue()
+
+
+def _hard_task(results: Results, reference: str) -> int:
+    """The first task that the reference fails, better still one that the first policy solves."""
+    failed = ~np.asarray(results[reference].success)
+    solved = np.asarray(next(iter(results.values())).success)
+    return int(np.argmax(2 * failed + solved))
 
 
 def _plain(row: Summary) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -11,22 +12,30 @@ import numpy as np
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.tasks import Tasks, circle_tasks, random_tasks
 from vertiwm_jax.terrain import files, vertibench, worlds
-from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.map import TerrainMap, stack
 from vertiwm_jax.terrain.worlds import MEDIAN_SLOPE_DEG, WorldConfig
+
+Suite = Literal["easy", "hard", "obstacles"]
+SUITES: dict[Suite, WorldConfig] = {
+    "easy": WorldConfig(difficulties=("low", "mid")),
+    "hard": WorldConfig(difficulties=("high",)),
+    "obstacles": WorldConfig(difficulties=("low", "mid"), rocks=20, trees=2),
+}
+"""Procedural worlds to test on; Verti-Bench's have 10, 20 or 40 rocks and a tree for each ten."""
 
 
 @dataclass(frozen=True)
 class GroundConfig:
     """Where policies learn and where they are tested."""
 
-    training: WorldConfig = WorldConfig(difficulties=("mid", "high"))
+    training: WorldConfig = WorldConfig(("mid", "high"), rocks=20, trees=2, obstructed=0.5)
     """Procedural worlds to train on, unless maps are given; low ones teach little."""
-    testing: WorldConfig = WorldConfig()
-    """Procedural worlds to test on."""
     train_worlds: int = 180
-    """Procedural worlds to train on."""
-    held_out_worlds: int = 18
-    """Procedural worlds to test on."""
+    """How many of them."""
+    suites: tuple[Suite, ...] = ("easy", "hard", "obstacles")
+    """Procedural worlds to test on, unless maps are given."""
+    suite_worlds: int = 6
+    """How many of each suite."""
     held_out_every: int = 5
     """Of given maps, every so-manieth is not trained on but tested on."""
     starts: int = 4096
@@ -38,6 +47,10 @@ class GroundConfig:
     obstacles: bool = False
     """Whether the rocks and trees of given maps stand there; without them as in the paper."""
 
+    def __post_init__(self):
+        if not self.suites:
+            raise ValueError(f"suites: expected some of {', '.join(SUITES)}, found none")
+
 
 def grounds(
     config: GroundConfig, path: Path | None, key: jax.Array
@@ -48,10 +61,8 @@ def grounds(
     """
     if path is None:
         train_key, test_key = jax.random.split(key)
-        return (
-            worlds.generate(jax.random.split(train_key, config.train_worlds), config.training),
-            worlds.generate(jax.random.split(test_key, config.held_out_worlds), config.testing),
-        )
+        train = worlds.generate(jax.random.split(train_key, config.train_worlds), config.training)
+        return train, _suites(config, test_key)
     terrain = load(config, path)
     if terrain.worlds < config.held_out_every:
         raise ValueError(
@@ -86,12 +97,33 @@ def test_tasks(config: GroundConfig, terrain: TerrainMap) -> Tasks:
     )
 
 
+def suites(terrain: TerrainMap) -> list[str]:
+    """The suite that each world belongs to; rough worlds with obstacles are of two."""
+    names = {(False, False): "easy", (True, False): "hard", (False, True): "obstacles"}
+    return [
+        names.get((name in ("high", "extreme"), any(heights > 0)), "hard, obstacles")
+        for name, heights in zip(
+            difficulties(terrain), np.asarray(terrain.obstacles[..., 4]), strict=True
+        )
+    ]
+
+
 def difficulties(terrain: TerrainMap) -> list[str]:
     """The preset of difficulty that each world's median slope is nearest to."""
     names = list(MEDIAN_SLOPE_DEG)
     presets = np.array(list(MEDIAN_SLOPE_DEG.values()))
     slopes = map(_median_slope_deg, np.asarray(terrain.elevation) / float(terrain.resolution))
     return [names[int(np.argmin(np.abs(presets - slope)))] for slope in slopes]
+
+
+def _suites(config: GroundConfig, key: jax.Array) -> TerrainMap:
+    """Worlds of the configured suites; those of a suite do not depend on which others there are."""
+    drawn = []
+    for number, (name, worlds_of) in enumerate(SUITES.items()):
+        if name in config.suites:
+            keys = jax.random.split(jax.random.fold_in(key, number), config.suite_worlds)
+            drawn.append(worlds.generate(keys, worlds_of))
+    return stack(drawn)
 
 
 def _subset(terrain: TerrainMap, chosen: np.ndarray) -> TerrainMap:

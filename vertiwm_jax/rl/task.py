@@ -31,7 +31,7 @@ class TaskConfig:
     navigation: NavigationConfig = NavigationConfig()
     """What the task is."""
     model: ModelName = "builtin"
-    """What moves the vehicle while learning; in tests it is always the built-in simulator."""
+    """What moves the vehicle while learning; tests after it are in the built-in simulator."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
     simulator: Simulator = Simulator()
@@ -68,9 +68,9 @@ def held_out(config: TaskConfig) -> TerrainMap:
     return ground.grounds(config.ground, config.worlds, config.key("worlds"))[1]
 
 
-def test_environment(config: TaskConfig, terrain: TerrainMap) -> Task:
-    """The test on these worlds, in the built-in simulator."""
-    return environment(config, "builtin", terrain, ground.test_tasks(config.ground, terrain))
+def test_environment(config: TaskConfig, terrain: TerrainMap, model: ModelName = "builtin") -> Task:
+    """The test on these worlds, inside one of the models."""
+    return environment(config, model, terrain, ground.test_tasks(config.ground, terrain))
 
 
 def environment(config: TaskConfig, model: ModelName, terrain: TerrainMap, tasks: Tasks) -> Task:

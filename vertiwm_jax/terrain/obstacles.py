@@ -6,14 +6,6 @@ import jax.numpy as jnp
 from vertiwm_jax.terrain.map import TerrainMap
 
 
-def height_above_ground(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
-    """`[..., 2]` p_world to `[...]` height of the tallest obstacle over each point, m; else 0."""
-    obstacles = terrain.obstacles[terrain.world]
-    offset = jnp.abs(xy[..., None, :] - obstacles[:, :2])
-    over = jnp.all(offset <= obstacles[:, 2:4] / 2, axis=-1)
-    return jnp.max(jnp.where(over, obstacles[:, 4], 0.0), axis=-1, initial=0.0)
-
-
 def collides(
     terrain: TerrainMap, xy: jax.Array, yaw: jax.Array, length: float, width: float
 ) -> jax.Array:

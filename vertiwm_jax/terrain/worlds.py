@@ -69,13 +69,15 @@ class WorldConfig:
 
     difficulties: preset names, or median slopes in degrees.
     kinds: rigid ground, soil, or rectangles of soil in rigid ground.
-    rocks, trees: how many of each stand in every world.
+    rocks, trees: how many of each stand in a world, if any do.
+    obstructed: probability that some do.
     """
 
     difficulties: tuple[Difficulty | float, ...] = ("low", "mid", "high")
     kinds: tuple[Kind, ...] = ("rigid", "deformable", "mixed")
     rocks: int = 0
     trees: int = 0
+    obstructed: float = 1.0
     relief: ReliefConfig = ReliefConfig()
 
     def __post_init__(self) -> None:
@@ -97,6 +99,8 @@ class WorldConfig:
                 )
         if not (self.difficulties and self.kinds):
             raise ValueError("WorldConfig: expected a difficulty and a kind or more, found none")
+        if not 0 <= self.obstructed <= 1:
+            raise ValueError(f"WorldConfig: obstructed: expected 0 to 1, found {self.obstructed}")
 
 
 def labels(config: WorldConfig, count: int) -> list[tuple[Difficulty | float, Kind]]:
@@ -117,6 +121,7 @@ def generate(keys: jax.Array, config: WorldConfig) -> TerrainMap:
         config.relief,
         config.rocks,
         config.trees,
+        config.obstructed,
     )
     elevation, semantic, friction, obstacles = worlds
     return TerrainMap(
@@ -135,7 +140,7 @@ def generate(keys: jax.Array, config: WorldConfig) -> TerrainMap:
     )
 
 
-@partial(jax.jit, static_argnames=("relief", "rocks", "trees"))
+@partial(jax.jit, static_argnames=("relief", "rocks", "trees", "obstructed"))
 def _worlds(
     keys: jax.Array,
     slope_deg: jax.Array,
@@ -143,6 +148,7 @@ def _worlds(
     relief: ReliefConfig,
     rocks: int,
     trees: int,
+    obstructed: float,
 ) -> tuple[jax.Array, ...]:
     def world(inputs: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         key, slope_deg, kind = inputs
@@ -152,7 +158,7 @@ def _worlds(
             _relief(relief_key, slope_deg, relief),
             semantic,
             _friction(friction_key, semantic),
-            _obstacles(obstacle_key, rocks, trees),
+            _obstacles(obstacle_key, rocks, trees, obstructed),
         )
 
     # One after the other: `vmap` would be no faster, compile twice as long, and take W times the
@@ -272,8 +278,11 @@ def _friction(key: jax.Array, semantic: jax.Array) -> jax.Array:
     return jnp.where(semantic < FIRST_DEFORMABLE, jnp.clip(drawn, *FRICTION_LIMITS), 0.0)
 
 
-def _obstacles(key: jax.Array, rocks: int, trees: int) -> jax.Array:
-    """`[rocks + trees, 5]` boxes anywhere on the map but near the circle of starts and goals."""
+def _obstacles(key: jax.Array, rocks: int, trees: int, obstructed: float) -> jax.Array:
+    """`[rocks + trees, 5]` boxes anywhere on the map but near the circle of starts and goals.
+
+    Zeros, which are no obstacles, in all but a share `obstructed` of worlds.
+    """
     drawn = jax.random.uniform(key, (rocks + trees, 4))
     scale = 0.7 + 0.5 * drawn[:rocks, :1]
     sizes = jnp.concatenate(
@@ -288,4 +297,5 @@ def _obstacles(key: jax.Array, rocks: int, trees: int) -> jax.Array:
     inner = START_RADIUS - START_CLEARANCE - reach
     inner *= jnp.sqrt(drawn[:, 3])
     place *= jnp.where(blocking, inner / jnp.maximum(radius, 1e-6), 1.0)[:, None]
-    return jnp.concatenate([place, sizes], axis=-1)
+    some = jax.random.uniform(jax.random.fold_in(key, 0)) < obstructed
+    return jnp.where(some, jnp.concatenate([place, sizes], axis=-1), 0.0)
