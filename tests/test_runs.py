@@ -9,7 +9,7 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event
 
 from vertiwm_jax import config, runs
-from vertiwm_jax.runs import Progress, Run, RunError, read_metrics, write_atomic
+from vertiwm_jax.runs import Progress, Run, RunError, new_folder, read_metrics, write_atomic
 
 
 @dataclass(frozen=True)
@@ -144,6 +144,20 @@ def test_write_atomic_replaces(tmp_path):
     write_atomic(path, b"\x00\x01")
     assert path.read_bytes() == b"\x00\x01"
     assert os.listdir(tmp_path) == ["table.txt"]
+
+
+def test_a_new_folder_is_whole_or_not_there(tmp_path):
+    with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "made") as unfinished:
+        (unfinished / "first").touch()
+        raise KeyboardInterrupt
+    assert os.listdir(tmp_path) == []
+    with new_folder(tmp_path / "made") as unfinished:
+        (unfinished / "first").touch()
+    assert os.listdir(tmp_path) == ["made"] and os.listdir(tmp_path / "made") == ["first"]
+    with pytest.raises(RunError, match="expected no such folder"), new_folder(tmp_path / "made"):
+        raise AssertionError
+    with pytest.raises(RunError, match="first/made: cannot make"):
+        new_folder(tmp_path / "made" / "first" / "made").__enter__()
 
 
 def test_a_full_disk_leaves_the_old_file(tmp_path):

@@ -4,8 +4,9 @@ import contextlib
 import json
 import math
 import os
+import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -243,6 +244,27 @@ def write_atomic(path: str | Path, data: bytes | str) -> None:
             raise
     except OSError as error:
         raise RunError(f"{path}: cannot write, the file is as it was: {error}") from error
+
+
+@contextlib.contextmanager
+def new_folder(path: str | Path) -> Iterator[Path]:
+    """A folder to fill, which then becomes the new folder at `path` as a whole, or not at all.
+
+    One that is there already, or that cannot be made, raises `RunError`.
+    """
+    path = Path(path)
+    if path.exists():
+        raise RunError(f"{path}: expected no such folder yet, found one; remove it first")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir(parents=True)
+    except OSError as error:
+        raise RunError(f"{path}: cannot make the folder: {error}") from error
+    try:
+        yield partial
+        partial.rename(path)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _append(path: Path, line: str) -> None:

@@ -41,6 +41,23 @@ def test_layout_and_units():
     np.testing.assert_allclose(seen[observation.GOAL], [0.4, 1.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(seen[11:13], action)
 
+    layout = observation.LAYOUT
+    places = [np.arange(len(seen))[part.where] for part in layout.values()]
+    assert sorted(np.concatenate(places)) == list(range(len(seen)))
+    named = {name: (seen[part.where] * part.scale).tolist() for name, part in layout.items()}
+    assert named["roll"] == pytest.approx([0.1]) and named["pitch"] == pytest.approx([-0.2])
+    assert named["velocity"] == pytest.approx([3.0, 0.1, -0.2])
+    assert named["angular velocity"] == pytest.approx([0.1, 0.2, 0.3])
+    assert named["goal distance"] == pytest.approx([20.0])
+    assert named["goal bearing"] == pytest.approx([1.0, 0.0], abs=1e-6)
+    assert named["last action"] == pytest.approx([0.5, -0.25])
+    ahead = observation.arcs_ahead(jnp.asarray(seen))
+    for name, found in zip(("height", "crown", "rise", "bank", "twist"), ahead, strict=True):
+        np.testing.assert_array_equal(seen[layout[name].where][1:], found.ravel())
+    classes = seen[CLASSES].reshape(-1, 2)
+    np.testing.assert_array_equal(seen[layout["friction"].where], classes[:, 0])
+    np.testing.assert_array_equal(seen[layout["sinkage"].where], classes[:, 1])
+
 
 def test_poses_lie_on_the_arcs_of_a_bicycle():
     xy, heading = observation.poses_ahead(CHASSIS)

@@ -4,6 +4,8 @@ Nothing is in world coordinates, so a policy cannot learn a map by heart, and mo
 the world with the vehicle leaves the observation as it is.
 """
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +22,7 @@ ARC_STEERING = np.linspace(-1.0, 1.0, 9)  # of the front wheels' largest angle
 ARC_STATIONS = np.array([0.45, 0.9, 1.4, 2.0, 2.7, 3.5, 4.5, 6.0])  # wheelbases along an arc
 _LARGEST_STEERING = 0.37  # rad
 _POSES = 1 + ARC_STEERING.size * ARC_STATIONS.size  # the first is where it stands now
-_CLASSES = 1 + np.arange(ARC_STEERING.size * ARC_STATIONS.size).reshape(9, 8)[::4, ::2].ravel()
+CLASS_PLACES = 1 + np.arange(ARC_STEERING.size * ARC_STATIONS.size).reshape(9, 8)[::4, ::2].ravel()
 
 _ANGLE_SCALE = 0.5  # rad
 _SPEED_SCALE = 5.0  # m/s
@@ -35,11 +37,44 @@ _CLEARANCE = 0.3  # m that is kept from obstacles
 
 GOAL = slice(8, 11)
 """Where the observation holds the distance over 50 m and the cosine and sine of the bearing."""
-OBSERVATION_SIZE = 13 + 5 * _POSES + 2 * _CLASSES.size
+OBSERVATION_SIZE = 13 + 5 * _POSES + 2 * CLASS_PLACES.size
 GROUND = slice(13, 13 + 5 * _POSES)
 """Where it holds height, crown, rise, bank and twist, of all places in turn."""
 OBSERVATION_LIMIT = 10.0
 """Every entry is clipped to this size."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Where the observation holds something, in which unit, and what 1 stands for in it."""
+
+    where: slice
+    unit: str
+    scale: float
+
+
+def _of_places(number: int, unit: str, scale: float) -> Part:
+    first = GROUND.start + number * _POSES
+    return Part(slice(first, first + _POSES), unit, scale)
+
+
+LAYOUT = {
+    "roll": Part(slice(0, 1), "rad", _ANGLE_SCALE),
+    "pitch": Part(slice(1, 2), "rad", _ANGLE_SCALE),
+    "velocity": Part(slice(2, 5), "m/s", _SPEED_SCALE),
+    "angular velocity": Part(slice(5, 8), "rad/s", 1.0),
+    "goal distance": Part(slice(8, 9), "m", _DISTANCE_SCALE),
+    "goal bearing": Part(slice(9, 11), "cosine and sine", 1.0),
+    "last action": Part(slice(11, 13), "speed and steering in [-1, 1]", 1.0),
+    "height": _of_places(0, "m", _HEIGHT_SCALE),
+    "crown": _of_places(1, "m", _CROWN_SCALE),
+    "rise": _of_places(2, "m/m", _SLOPE_SCALE),
+    "bank": _of_places(3, "m/m", _SLOPE_SCALE),
+    "twist": _of_places(4, "m/m", _TWIST_SCALE),
+    "friction": Part(slice(GROUND.stop, OBSERVATION_SIZE, 2), "1", 1.0),
+    "sinkage": Part(slice(GROUND.stop + 1, OBSERVATION_SIZE, 2), "m", _SINKAGE_SCALE),
+}
+"""What `observe` gives, by name; -1 in the last two means off the map."""
 
 
 def distance_and_bearing(position: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -150,7 +185,7 @@ def observe(
         (fl + rr - fr - rl) / (2 * chassis.track * _TWIST_SCALE),
     )
 
-    xy = at(place[_CLASSES])
+    xy = at(place[CLASS_PLACES])
     below = query.surface(terrain, xy)
     sinkage = plate_sinkage(terrain)[below.semantic] / _SINKAGE_SCALE
     classes = jnp.stack([below.friction, sinkage], axis=-1)

@@ -1,0 +1,246 @@
+"""Exported policies of every kind compute what the trained ones do, whatever runs them."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import onnxruntime
+import pytest
+from doors import refusal
+from env.worlds import SNOW, bicycle_env, hills, task
+from flax import struct
+
+from vertiwm_jax import checkpoints, export, runs
+from vertiwm_jax import config as configuration
+from vertiwm_jax.deploy import onnx_graph, run_policy, stablehlo
+from vertiwm_jax.env import observation
+from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZE
+from vertiwm_jax.evaluation import navigation
+from vertiwm_jax.evaluation.controllers import LookAhead, StraightToGoal
+from vertiwm_jax.networks.policy import Actor, SquashedActor
+from vertiwm_jax.rl import task as tasks
+from vertiwm_jax.rl.learned import Corrected, MeanAction
+from vertiwm_jax.rl.normalise import RunningStatistics
+from vertiwm_jax.sac import SACTraining
+from vertiwm_jax.state import VehicleState
+from vertiwm_jax.terrain import map as terrain_map
+
+CONFIG = NavigationConfig(speed_range=(-1.0, 5.0))
+ACTORS = {
+    "ppo": Actor(2, (8, 6, 5), -0.5, ARCS),
+    "sac": SquashedActor(2, (8, 6), -0.5, ARCS),
+    "td3": SquashedActor(2, (8,), None, ARCS),
+}
+BASES = {"look ahead": LookAhead(CONFIG), "straight to goal": StraightToGoal(CONFIG), "none": None}
+TINY = """
+ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 1}
+simulator: {substeps: 1}
+navigation: {settle_steps: 1}
+action_repeat: 3
+loop: {seeds: 2}
+sac:
+  {transitions: 64, num_envs: 8, num_steps: 8, batch: 8, capacity: 64, warm_up: 64, hidden: [8]}
+"""
+
+
+def policy_of(actor, base):
+    """A policy of random weights, whose actions are not all at their limits."""
+    rng = np.random.default_rng(0)
+    shapes = jax.eval_shape(actor.init, jax.random.key(0), jnp.zeros(OBSERVATION_SIZE))
+
+    def drawn(leaf):
+        return jnp.float32(rng.normal(0, 1 / np.sqrt(leaf.shape[0]), leaf.shape))
+
+    mean, variance = jnp.float32(rng.uniform(size=(2, OBSERVATION_SIZE)))
+    statistics = RunningStatistics(mean, variance, jnp.float32(9))
+    learned = MeanAction(actor, jax.tree.map(drawn, shapes), statistics)
+    return Corrected(base, learned) if base else learned
+
+
+def observations():
+    """`[B, O]` 64 usual ones, any within the limit, and its corners; goals all about."""
+    rng = np.random.default_rng(0)
+    usual = rng.normal(0, 0.5, (64, OBSERVATION_SIZE))
+    limit = OBSERVATION_LIMIT
+    anything = rng.uniform(-limit, limit, (32, OBSERVATION_SIZE))
+    corners = rng.choice([-limit, 0.0, limit], (32, OBSERVATION_SIZE))
+    same = np.full((3, OBSERVATION_SIZE), [[-limit], [0.0], [limit]])
+    seen = np.concatenate([usual, anything, corners, same])
+    bearing = np.linspace(-np.pi, np.pi, len(seen))
+    seen[:64, 9], seen[:64, 10] = np.cos(bearing[:64]), np.sin(bearing[:64])
+    around = [[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0], [-1, 1e-7], [-1, -1e-7]]
+    seen[-len(around) :, 9:11] = around
+    return seen.astype(np.float32)
+
+
+def in_onnx(model, seen):
+    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    return session.run(["action"], {"observation": seen})[0]
+
+
+def written(policy, folder):
+    """The files of a policy, as on a robot, and the policy in NumPy."""
+    made = export.files(policy, CONFIG, 8, onnx_graph.record)
+    for name, data in made.items():
+        runs.write_atomic(folder / name, data)
+    return made, run_policy.load(folder)
+
+
+@jax.jit
+def act(policy, seen):
+    """As `navigation.evaluate` asks a policy, weights as arguments."""
+    return policy(seen, jax.random.key(1))
+
+
+@pytest.mark.parametrize(
+    ("actor", "base"),
+    [(actor, "look ahead") for actor in ACTORS] + [("ppo", "straight to goal"), ("sac", "none")],
+)
+def test_all_forms_of_a_policy_agree(actor, base, tmp_path):
+    policy, seen = policy_of(ACTORS[actor], BASES[base]), observations()
+    made, in_numpy = written(policy, tmp_path)
+    in_stablehlo = jax.export.deserialize(bytearray(made["policy.stablehlo"])).call
+    expected = np.asarray(act(policy, seen))
+    assert np.ptp(expected, axis=0).min() > 0.3
+    # Near the limits costs of arcs are hundreds, which float32 rounds before they are raised.
+    tolerance = np.where(np.arange(len(seen)) < 64, 1e-5, 2e-4)[:, None]
+    for form in (in_stablehlo, in_numpy, lambda seen: in_onnx(made["policy.onnx"], seen)):
+        for some in (slice(None), slice(5, 6)):
+            found = np.asarray(form(seen[some]))
+            assert found.dtype == np.float32
+            assert np.all(np.abs(found - expected[some]) <= tolerance[some])
+    np.testing.assert_allclose(in_numpy(seen[5]), expected[5], atol=1e-5)
+    command = CONFIG.command(jnp.asarray(expected))
+    speed, steering = in_numpy.command(expected)
+    np.testing.assert_allclose(speed, command.speed, atol=1e-6)
+    np.testing.assert_allclose(steering, command.steering, atol=1e-6)
+    # On the robot there is nothing but NumPy.
+    script = "import sys, run_policy; run_policy.load('.'); print(*sys.modules)"
+    found = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True)
+    loaded = found.stdout.decode().split()
+    assert "numpy" in loaded and not {"jax", "vertiwm_jax", "onnx"} & set(loaded)
+
+
+def test_observations_that_are_none_are_named(tmp_path):
+    _, in_numpy = written(policy_of(ACTORS["ppo"], None), tmp_path)
+    with pytest.raises(ValueError, match=r"expected \[\.\.\., 402\], found \(7,\)"):
+        in_numpy(np.zeros(7))
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        in_numpy(np.full(OBSERVATION_SIZE, np.nan))
+
+
+@struct.dataclass
+class Robot:
+    """A policy that runs outside JAX."""
+
+    policy: run_policy.Policy = struct.field(pytree_node=False)
+
+    def __hash__(self):
+        return id(self)
+
+    def __call__(self, observation, key):
+        answer = jax.ShapeDtypeStruct((2,), jnp.float32)
+        return jax.pure_callback(
+            lambda seen: self.policy(seen), answer, observation, vmap_method="expand_dims"
+        )
+
+
+def test_the_robot_drives_as_the_test_does(tmp_path):
+    policy = policy_of(ACTORS["ppo"], BASES["look ahead"])
+    terrain = terrain_map.build(hills(), np.full((16, 16), SNOW))
+    config = NavigationConfig(speed_range=CONFIG.speed_range, horizon_seconds=4.0)
+    env, params = bicycle_env(terrain, task((-20.0, 0.0), (20.0, 5.0)), config)
+    key = jax.random.key(0)
+    expected = navigation.evaluate(env, params, policy, key)
+    found = navigation.evaluate(env, params, Robot(written(policy, tmp_path)[1]), key)
+    assert expected.driven[0] > 3
+    np.testing.assert_allclose(found.position, expected.position, atol=1e-3)
+
+
+@pytest.mark.parametrize("size", [129, 41])
+def test_the_observation_of_map_arrays(size):
+    semantic = np.full((16, 16), SNOW)
+    semantic[:, 8:] = 0
+    boxes = np.array([[18, 4, 2, 3, 1], [0, 0, 0, 0, 0]], np.float32)
+    terrain = terrain_map.build(hills(size), semantic, obstacles=boxes)
+    arrays = (terrain.elevation, terrain.semantic, terrain.friction, terrain.obstacles)
+    state = VehicleState.from_vector(jnp.array([15, 1, 2, 0.1, -0.2, 0.7, 3, 0, 0, 0, 0, 0.1]))
+    goal, action = jnp.array([20.0, 5.0, 1.0]), jnp.array([0.3, -0.4])
+    exported = jax.export.deserialize(bytearray(stablehlo.observe(Chassis())))
+    arguments = (
+        *(x[0] for x in arrays),
+        terrain.origin,
+        terrain.resolution,
+        state.vector,
+        goal,
+        action,
+    )
+    expected = jax.jit(observation.observe, static_argnums=1)(
+        terrain, Chassis(), state, goal, action
+    )
+    assert 0 < (observation.arcs_ahead(expected)[1] == 7.5).sum() < 72
+    np.testing.assert_allclose(exported.call(*arguments), expected, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def run_and_policy(tmp_path_factory):
+    """A run of two seeds with random weights, and the policy of the second."""
+    run = tmp_path_factory.mktemp("run")
+    (run / "config.yaml").write_text(TINY)
+    config = configuration.load(SACTraining, run / "config.yaml")
+    level = terrain_map.build(np.zeros((129, 129)), np.zeros((1, 1), int))
+    training = tasks.test_environment(config, level)
+    algorithm, keys = config.algorithm(training.env), jax.random.split(jax.random.key(0))
+    shapes = jax.eval_shape(jax.vmap(algorithm.init, (None, 0)), training.params, keys)
+    rng = np.random.default_rng(0)
+
+    def drawn(leaf):
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return keys
+        return jnp.asarray(rng.uniform(0.1, 1, leaf.shape), leaf.dtype)
+
+    state = jax.tree.map(drawn, shapes)
+    checkpoints.save(run / "checkpoints", 1, state, keep=1)
+    learned = algorithm.policy(training.params, jax.tree.map(lambda x: x[1], state))
+    return run, Corrected(LookAhead(config.navigation), learned)
+
+
+def test_a_run_is_exported_as_it_is_evaluated(run_and_policy, tmp_path, capsys):
+    run, policy = run_and_policy
+    robot = tmp_path / "robot"
+    export.main([str(run), "--seed", "1", "--output", str(robot)])
+    assert str(robot) in capsys.readouterr().out
+    assert {path.name for path in robot.iterdir()} == {
+        "policy.json", "policy.npz", "policy.onnx", "policy.stablehlo", "observe.stablehlo",
+        "run_policy.py",
+    }  # fmt: skip
+    in_numpy, seen = run_policy.load(robot), observations()
+    np.testing.assert_allclose(in_numpy(seen[:64]), act(policy, seen[:64]), atol=1e-5)
+    assert in_numpy.about["held_while_learning"] == 3
+    assert in_numpy.about["action"]["standing"] == [-1.0, 0.0]
+    message = refusal(export.main, run, "--output", robot)
+    assert "robot: expected no such folder yet, found one" in message
+
+
+def test_what_cannot_be_exported_is_named_and_leaves_nothing(run_and_policy, tmp_path, monkeypatch):
+    run, _ = run_and_policy
+    assert "none/config.yaml: no such file" in refusal(export.main, tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+    assert "seed: expected 0 to 1, found 2" in refusal(export.main, run, "--seed", 2)
+    (tmp_path / "config.yaml").write_text(TINY)
+    assert "expected checkpoints of a training" in refusal(export.main, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
+    monkeypatch.delitem(sys.modules, "vertiwm_jax.deploy.onnx_graph")
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    assert 'pip install "vertiwm-jax[export]"' in refusal(export.main, run)
+    assert {path.name for path in run.iterdir()} == {"config.yaml", "checkpoints"}
+
+
+@pytest.mark.parametrize("function", [np.sin, np.sort])
+def test_what_cannot_be_recorded_is_refused(function):
+    with pytest.raises(TypeError):
+        onnx_graph.record(function, 3, 3)

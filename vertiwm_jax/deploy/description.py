@@ -1,0 +1,81 @@
+"""A learned policy in plain numbers: what `policy.json` says of it, and its weights."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vertiwm_jax
+from vertiwm_jax.env import observation
+from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, LAYOUT, Part
+from vertiwm_jax.evaluation.controllers import REFERENCE, LookAhead, StraightToGoal
+from vertiwm_jax.networks.policy import SquashedActor
+from vertiwm_jax.rl import normalise
+from vertiwm_jax.rl.learned import Corrected, MeanAction
+from vertiwm_jax.state import STEP_SECONDS, Command
+from vertiwm_jax.terrain.classes import STANDARD
+
+_BASES = {LookAhead: "look ahead", StraightToGoal: REFERENCE}
+
+
+def about(policy: Corrected | MeanAction, config: NavigationConfig, held: int) -> dict[str, Any]:
+    """What the numbers of a policy mean, for JSON.
+
+    config: of the environment; held: steps for which its actions were held while it learned.
+    """
+    places, heading = observation.poses_ahead(config.chassis)
+    standing = config.action(Command(jnp.float32(0), jnp.float32(0)))
+    base = policy.base if isinstance(policy, Corrected) else None
+    return {
+        "vertiwm_jax": vertiwm_jax.__version__,
+        "step_seconds": STEP_SECONDS,
+        "held_while_learning": held,
+        "observation": {
+            "size": observation.OBSERVATION_SIZE,
+            "limit": observation.OBSERVATION_LIMIT,
+            "parts": {name: _part(part) for name, part in LAYOUT.items()},
+            "places": np.column_stack([places, heading]).tolist(),
+            "class_places": observation.CLASS_PLACES.tolist(),
+        },
+        "action": {
+            "speed_range": config.speed_range,
+            "steering_limit": config.steering_limit,
+            "standing": standing.tolist(),
+        },
+        "arcs": {"steering": ARC_STEERING.tolist(), "stations": ARC_STATIONS.tolist()},
+        "network": {
+            "normalised_limit": normalise.CLIP,
+            "squashed": isinstance(_learned(policy).actor, SquashedActor),
+        },
+        "base": None if base is None else {"name": _BASES[type(base)], **_numbers(base)},
+        "vehicle": dataclasses.asdict(config.chassis),
+        "ground_classes": STANDARD.names,
+    }
+
+
+def weights(policy: Corrected | MeanAction) -> dict[str, np.ndarray]:
+    """Weights of the actor, by layer, and `mean` and `std` `[O]` of observations; float32."""
+    learned = _learned(policy)
+    leaves = jax.tree.leaves_with_path(learned.params["params"])
+    named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    named.pop("log_std", None)  # which only exploration needs
+    named |= {"mean": learned.observations.mean, "std": learned.observations.std}
+    return {name: np.asarray(leaf, np.float32) for name, leaf in named.items()}
+
+
+def _learned(policy: Corrected | MeanAction) -> MeanAction:
+    return policy.correction if isinstance(policy, Corrected) else policy
+
+
+def _part(part: Part) -> dict[str, Any]:
+    where = [part.where.start, part.where.stop, part.where.step or 1]
+    return {"slice": where, "unit": part.unit, "scale": part.scale}
+
+
+def _numbers(base: Any) -> dict[str, float]:
+    """The settings of a controller, but for the environment's."""
+    names = [field.name for field in dataclasses.fields(base) if field.name != "config"]
+    return {name: getattr(base, name) for name in names}

@@ -1,0 +1,166 @@
+"""A driving policy in NumPy alone: observations to actions, and actions to commands.
+
+`python -m vertiwm_jax.export` puts this file beside the weights. It needs Python 3.10 and NumPy,
+and no other file of the package.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+About = dict[str, Any]
+Weights = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """An exported policy, called at every step of `about["step_seconds"]`.
+
+    about: what `policy.json` says. weights: what `policy.npz` holds, float32.
+    """
+
+    about: About
+    weights: Weights
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """`[..., O]` observations to `[..., 2]` float32 actions in [-1, 1].
+
+        Another O, and numbers that are not finite, raise `ValueError`.
+        """
+        observation = np.asarray(observation, np.float32)
+        size = self.about["observation"]["size"]
+        if observation.shape[-1:] != (size,):
+            raise ValueError(f"observation: expected [..., {size}], found {observation.shape}")
+        if not np.isfinite(observation).all():
+            raise ValueError("observation: expected finite numbers, found others")
+        flat = observation.reshape(-1, size)
+        return act(self.about, self.weights, flat).reshape(*observation.shape[:-1], 2)
+
+    def command(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`[..., 2]` actions to `[...]` speeds, m/s, and front-wheel angles, rad, left positive."""
+        action = np.clip(action, -1, 1)
+        low, high = self.about["action"]["speed_range"]
+        speed = low + (action[..., 0] + 1) / 2 * (high - low)
+        return speed, action[..., 1] * self.about["action"]["steering_limit"]
+
+
+def load(folder: str | Path) -> Policy:
+    """The policy in the folder that the export has made."""
+    about = json.loads((Path(folder) / "policy.json").read_text(encoding="utf-8"))
+    with np.load(Path(folder) / "policy.npz", allow_pickle=False) as file:
+        return Policy(about, dict(file))
+
+
+def act(about: About, weights: Weights, observation: np.ndarray) -> np.ndarray:
+    """`[B, O]` float32 observations to `[B, 2]` actions in [-1, 1].
+
+    What follows is written in functions of arrays and without their shapes, so that the export
+    can record it as an ONNX graph.
+    """
+    correction = np.clip(_learned(about, weights, observation), -1, 1)
+    if about["base"] is None:
+        return correction
+    base = {"look ahead": _look_ahead, "straight to goal": _straight_to_goal}[about["base"]["name"]]
+    return np.clip(base(about, observation) + correction, -1, 1)
+
+
+def _learned(about: About, weights: Weights, observation: np.ndarray) -> np.ndarray:
+    """The network: attention over arcs of constant steering, then dense layers."""
+    limit = about["network"]["normalised_limit"]
+    seen = np.clip((observation - weights["mean"]) / weights["std"], -limit, limit)
+    steering = _float32(about["arcs"]["steering"])[:, None]
+    ground = ("height", "crown", "rise", "bank", "twist")
+
+    before, after = _slice(about, "height").start, _slice(about, "twist").stop
+    here = [_part(about, seen, name)[:, :1] for name in ground]
+    rest = np.concatenate([seen[:, :before], *here, seen[:, after:]], axis=-1)
+    arcs = np.concatenate([_arcs(about, seen, name) for name in ground], axis=-1)
+
+    (context, _), (kernel, bias), *more, (score, score_bias) = _layers(weights, "Attention_0")
+    # The last row of the kernel is for the steering that an arc stands for.
+    x = np.tanh(arcs @ kernel[:-1] + steering @ kernel[-1:] + bias + (rest @ context)[:, None])
+    for kernel, bias in more:
+        x = np.tanh(x @ kernel + bias)
+    share = _softmax(x @ score + score_bias, axis=1)
+    steered = np.sum(share * steering, axis=1)
+
+    features = np.concatenate([np.sum(share * x, axis=1), np.max(x, axis=1), rest], axis=-1)
+    *hidden, (kernel, bias) = _layers(weights, "MLP_0")
+    for inner, inner_bias in hidden:
+        features = np.tanh(features @ inner + inner_bias)
+    # Networks that also say how certain they are do so in what is left out here.
+    mean = features @ kernel[:, :2] + bias[:2] + steered * _float32([0, 1])
+    return np.tanh(mean) if about["network"]["squashed"] else mean
+
+
+def _look_ahead(about: About, observation: np.ndarray) -> np.ndarray:
+    """Steers along the arc that keeps level and leads to the goal."""
+    base, tolerated = about["base"], about["base"]["tolerated"]
+    crown, rise, bank, twist = (
+        _arcs(about, observation, name) for name in ("crown", "rise", "bank", "twist")
+    )
+    cost = (
+        base["bank"] * np.square(np.maximum(np.abs(bank) - tolerated, 0))
+        + base["rise"] * np.square(np.maximum(np.abs(rise) - tolerated, 0))
+        + base["twist"] * np.square(twist)
+        + base["crown"] * np.square(np.maximum(crown, 0))
+    )
+    near_first = np.exp(-np.array(about["arcs"]["stations"]) / base["reach"])
+    cost = np.sum(cost * _float32(near_first), axis=2)
+    steering, limit = np.array(about["arcs"]["steering"]), about["action"]["steering_limit"]
+    turned = _float32(base["turning"] * np.tan(limit * steering))
+    off_goal = np.mod(_bearing(about, observation)[:, None] - turned + np.pi, 2 * np.pi) - np.pi
+    share = _softmax(-(cost + base["turn"] * np.square(off_goal)) / base["spread"], axis=1)
+    return _action(about, limit * np.sum(share * _float32(steering), axis=1))
+
+
+def _straight_to_goal(about: About, observation: np.ndarray) -> np.ndarray:
+    """Steers at the goal, blind to the ground."""
+    return _action(about, about["base"]["gain"] * _bearing(about, observation))
+
+
+def _action(about: About, steering: np.ndarray) -> np.ndarray:
+    """`[B]` rad to `[B, 2]` actions at the base's speed."""
+    low, high = about["action"]["speed_range"]
+    speed = (about["base"]["speed"] - low) / (high - low) * 2 - 1
+    steering = (steering / about["action"]["steering_limit"])[:, None]
+    return np.clip(steering * _float32([0, 1]) + _float32([speed, 0]), -1, 1)
+
+
+def _bearing(about: About, observation: np.ndarray) -> np.ndarray:
+    """`[B]` rad to the goal, left positive."""
+    towards = _part(about, observation, "goal bearing")
+    return np.arctan2(towards[:, 1], towards[:, 0])
+
+
+def _arcs(about: About, observation: np.ndarray, name: str) -> np.ndarray:
+    """What the observation holds of the places ahead, `[B, arcs, stations]`."""
+    shape = (-1, len(about["arcs"]["steering"]), len(about["arcs"]["stations"]))
+    return np.reshape(_part(about, observation, name)[:, 1:], shape)
+
+
+def _part(about: About, observation: np.ndarray, name: str) -> np.ndarray:
+    return observation[:, _slice(about, name)]
+
+
+def _slice(about: About, name: str) -> slice:
+    return slice(*about["observation"]["parts"][name]["slice"])
+
+
+def _layers(weights: Weights, network: str) -> list[tuple[np.ndarray, Any]]:
+    """Kernel and bias of each dense layer, the first to be computed first."""
+    names = [f"{network}.Dense_{i}" for i in range(len(weights))]
+    kernels = [name for name in names if f"{name}.kernel" in weights]
+    return [(weights[f"{name}.kernel"], weights.get(f"{name}.bias")) for name in kernels]
+
+
+def _softmax(x: np.ndarray, axis: int) -> np.ndarray:
+    raised = np.exp(x - np.max(x, axis=axis, keepdims=True))
+    return raised / np.sum(raised, axis=axis, keepdims=True)
+
+
+def _float32(numbers: Any) -> np.ndarray:
+    return np.asarray(numbers, np.float32)

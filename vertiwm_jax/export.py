@@ -1,0 +1,107 @@
+"""`python -m vertiwm_jax.export`: a learned policy as robots can run it."""
+
+import io
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+import tyro
+
+from vertiwm_jax import policy_training, runs
+from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.config import ConfigError
+from vertiwm_jax.deploy import description, run_policy, stablehlo
+from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.evaluate import training
+from vertiwm_jax.policy_training import TrainConfig
+from vertiwm_jax.rl.learned import Corrected, MeanAction
+from vertiwm_jax.runs import RunError
+from vertiwm_jax.terrain import map as terrain_map
+
+Record = Callable[..., bytes]
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write what a run has learned as robots can run it: StableHLO, ONNX, and NumPy alone."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of a policy's training."""
+    output: Path | None = None
+    """Folder to make; `export` in that of the run by default."""
+    seed: int = 0
+    """Which of the policies that the run trained side by side."""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; expected failures end in one line and a status that is not 0."""
+    command = tyro.cli(Export, args=argv, prog="python -m vertiwm_jax.export")
+    folder = command.output or command.run / "export"
+    try:
+        record, config = _recorder(), training(command.run / "config.yaml")
+        with runs.new_folder(folder) as unfinished:
+            policy = restore(config, command.run, command.seed)
+            made = files(policy, config.navigation, config.action_repeat, record)
+            for name, data in made.items():
+                runs.write_atomic(unfinished / name, data)
+    except (RunError, CheckpointError, ConfigError, OSError) as error:
+        sys.exit(f"error: {error}")
+    print(f"the policy is in {folder}")
+
+
+def restore(config: TrainConfig, run: Path, seed: int) -> Corrected | MeanAction:
+    """What the run in the folder `run` has learned, as tests drive it without planning.
+
+    `ConfigError` or `CheckpointError` if there is no such policy.
+    """
+    seeds = config.loop.seeds
+    if not 0 <= seed < seeds:
+        raise ConfigError(f"{run}: seed: expected 0 to {seeds - 1}, found {seed}")
+    # Checkpoints are read beside an environment of their kind, on any ground.
+    level = terrain_map.build(np.zeros((129, 129)), np.zeros((1, 1), np.int32))
+    policies = policy_training.learned(replace(config, planning=None), level, run)
+    policy = list(policies.values())[seed]
+    assert isinstance(policy, Corrected | MeanAction)
+    return policy
+
+
+def files(
+    policy: Corrected | MeanAction, config: NavigationConfig, held: int, record: Record
+) -> dict[str, bytes | str]:
+    """What the folder of a policy holds, by name.
+
+    config, held: as in `description.about`; record: `onnx_graph.record`.
+    """
+    about, weights = description.about(policy, config, held), description.weights(policy)
+    arrays = io.BytesIO()
+    np.savez(arrays, allow_pickle=False, **weights)
+    sizes = about["observation"]["size"], 2
+    return {
+        "policy.json": json.dumps(about, indent=1) + "\n",
+        "policy.npz": arrays.getvalue(),
+        "policy.onnx": record(partial(run_policy.act, about, weights), *sizes),
+        # The key is not used: no learned policy is random.
+        "policy.stablehlo": stablehlo.policy(lambda seen: policy(seen, jax.random.key(0))),
+        "observe.stablehlo": stablehlo.observe(config.chassis),
+        "run_policy.py": Path(run_policy.__file__).read_bytes(),
+    }
+
+
+def _recorder() -> Record:
+    try:
+        from vertiwm_jax.deploy.onnx_graph import record
+    except ImportError as error:
+        raise ConfigError(
+            f"policy.onnx: expected the package onnx to write it, found: {error}; "
+            'pip install "vertiwm-jax[export]"'
+        ) from None
+    return record
+
+
+if __name__ == "__main__":
+    main()
