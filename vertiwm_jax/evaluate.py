@@ -30,6 +30,10 @@ from vertiwm_jax.td3 import TD3Training
 from vertiwm_jax.world_model.choice import ModelName, choose, fitted
 from vertiwm_jax.world_model.nesam import SoilSource
 
+ALGORITHMS: dict[str, type[TrainConfig]] = {
+    kind.name: kind for kind in (PPOTraining, SACTraining, TD3Training)
+}
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -169,8 +173,7 @@ def _navigate(command: Navigation) -> None:
 def training(file: Path) -> TrainConfig:
     """The configuration of a training, by the algorithm whose settings are in the file."""
     text = file.read_text(encoding="utf-8") if file.is_file() else ""
-    kinds = (PPOTraining, SACTraining, TD3Training)
-    named = [kind for kind in kinds if f"\n{kind.name}:" in f"\n{text}"]
+    named = [kind for name, kind in ALGORITHMS.items() if f"\n{name}:" in f"\n{text}"]
     return configuration.load(named[0] if named else PPOTraining, file)
 
 

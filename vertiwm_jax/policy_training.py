@@ -93,7 +93,7 @@ def main(kind: type[TrainConfig], argv: Sequence[str] | None = None) -> None:
     program = f"python -m vertiwm_jax.{kind.name}"
     config = configuration.parse_resumable(kind, kind.name, argv, program)
     with failures_in_one_line():
-        run_folder = _train_and_report(config)
+        run_folder = train_and_report(config)
     print(f"all of it is in {run_folder}")
 
 
@@ -140,7 +140,8 @@ def _policies(
     return rows
 
 
-def _train_and_report(config: TrainConfig) -> Path:
+def train_and_report(config: TrainConfig) -> Path:
+    """Trains, or goes on with, a policy, tests it, and gives the folder of the run."""
     if config.compile_cache:
         jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
     try:

@@ -60,9 +60,8 @@ def grounds(
     path: see `load`. Too few maps to hold any out raise `ValueError`.
     """
     if path is None:
-        train_key, test_key = jax.random.split(key)
-        train = worlds.generate(jax.random.split(train_key, config.train_worlds), config.training)
-        return train, _suites(config, test_key)
+        keys = jax.random.split(jax.random.split(key)[0], config.train_worlds)
+        return worlds.generate(keys, config.training), suite_worlds(config, key)
     terrain = load(config, path)
     if terrain.worlds < config.held_out_every:
         raise ValueError(
@@ -72,6 +71,19 @@ def grounds(
     number = np.arange(terrain.worlds)
     held_out = number % config.held_out_every == config.held_out_every - 1
     return _subset(terrain, ~held_out), _subset(terrain, held_out)
+
+
+def suite_worlds(config: GroundConfig, key: jax.Array) -> TerrainMap:
+    """Worlds of the configured suites that `grounds` holds out, by the same key.
+
+    Those of a suite do not depend on which others are configured.
+    """
+    drawn, test_key = [], jax.random.split(key)[1]
+    for number, (name, worlds_of) in enumerate(SUITES.items()):
+        if name in config.suites:
+            keys = jax.random.split(jax.random.fold_in(test_key, number), config.suite_worlds)
+            drawn.append(worlds.generate(keys, worlds_of))
+    return stack(drawn)
 
 
 def load(config: GroundConfig, path: Path) -> TerrainMap:
@@ -114,16 +126,6 @@ def difficulties(terrain: TerrainMap) -> list[str]:
     presets = np.array(list(MEDIAN_SLOPE_DEG.values()))
     slopes = map(_median_slope_deg, np.asarray(terrain.elevation) / float(terrain.resolution))
     return [names[int(np.argmin(np.abs(presets - slope)))] for slope in slopes]
-
-
-def _suites(config: GroundConfig, key: jax.Array) -> TerrainMap:
-    """Worlds of the configured suites; those of a suite do not depend on which others there are."""
-    drawn = []
-    for number, (name, worlds_of) in enumerate(SUITES.items()):
-        if name in config.suites:
-            keys = jax.random.split(jax.random.fold_in(key, number), config.suite_worlds)
-            drawn.append(worlds.generate(keys, worlds_of))
-    return stack(drawn)
 
 
 def _subset(terrain: TerrainMap, chosen: np.ndarray) -> TerrainMap:

@@ -65,7 +65,10 @@ def environments(config: TaskConfig) -> tuple[Task, Task]:
 
 def held_out(config: TaskConfig) -> TerrainMap:
     """The worlds that `environments` tests on."""
-    return ground.grounds(config.ground, config.worlds, config.key("worlds"))[1]
+    key = config.key("worlds")
+    if config.worlds is None:
+        return ground.suite_worlds(config.ground, key)
+    return ground.grounds(config.ground, config.worlds, key)[1]
 
 
 def test_environment(config: TaskConfig, terrain: TerrainMap, model: ModelName = "builtin") -> Task:

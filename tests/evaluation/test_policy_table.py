@@ -1,0 +1,52 @@
+import json
+
+import jax.numpy as jnp
+import pytest
+
+from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.evaluation import policy_table
+from vertiwm_jax.evaluation.navigation import NavigationResult
+from vertiwm_jax.evaluation.policy_table import TrainingCost
+
+
+def result(reached: int) -> NavigationResult:
+    """Four episodes of 10 s, of which some reach the goal."""
+    zeros, points = jnp.zeros(4), jnp.zeros((4, 2, 3))
+    ending = jnp.where(jnp.arange(4) < reached, int(Ending.GOAL), int(Ending.STUCK))
+    return NavigationResult(
+        ending=ending,
+        steps=jnp.full(4, 100),
+        abs_roll=zeros,
+        abs_pitch=zeros,
+        driven=zeros,
+        final_distance=zeros,
+        world=zeros,
+        goal=points[:, 0],
+        position=points,
+        rpy=points,
+    )
+
+
+def test_costs_are_of_all_sessions_of_a_training(tmp_path):
+    # Two iterations, then hours until it was resumed.
+    lines = [
+        {"step": 1, "wall_time": 10.0, "transitions": 600, "transitions_per_second": 100.0},
+        {"step": 2, "wall_time": 16.0, "transitions": 1200, "transitions_per_second": 50.0},
+        {"step": 3, "wall_time": 9999.0, "transitions": 1800, "transitions_per_second": 200.0},
+    ]
+    (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    cost = TrainingCost.of(tmp_path)
+    assert cost.seconds == pytest.approx(6 + 12 + 3) and cost.transitions == 1800
+
+
+def test_every_simulator_has_a_table_of_all_policies():
+    costs = {"ppo in vertiwm": TrainingCost(120.0, 360_000)}
+    easy = {"ppo in vertiwm": result(3), "straight to goal": result(0)}
+    hard = {"ppo in vertiwm": result(1), "straight to goal": result(2)}
+    judged = {"builtin": {"easy": easy, "hard": hard}, "vertiwm": {"easy": hard}}
+    text = policy_table.markdown(costs, judged)
+    first, second = text.split("**vertiwm**")
+    learned, straight = first.strip().splitlines()[-2:]
+    assert learned.startswith("| ppo in vertiwm | 2.0 | 3,000 | 3/4, 10.0 s | 1/4, 10.0 s | 19/20")
+    assert straight == "| straight to goal |  |  | 0/4 | 2/4, 10.0 s |  |"
+    assert "hard" not in second and "| 1/4, 10.0 s |" in second

@@ -1,0 +1,164 @@
+"""`python -m vertiwm_jax.compare`: train policies in several models and judge them all alike."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from vertiwm_jax import config as configuration
+from vertiwm_jax import policy_training, runs
+from vertiwm_jax.config import ConfigError
+from vertiwm_jax.env.driver import Driver, Policy
+from vertiwm_jax.evaluate import ALGORITHMS
+from vertiwm_jax.evaluation import policy_table, report
+from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
+from vertiwm_jax.evaluation.navigation import NavigationResult
+from vertiwm_jax.evaluation.policy_table import TrainingCost
+from vertiwm_jax.evaluation.report import Results
+from vertiwm_jax.policy_training import TrainConfig
+from vertiwm_jax.rl import ground, task
+from vertiwm_jax.rl.ground import SUITES, GroundConfig, Suite
+from vertiwm_jax.runs import Run
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.training import failures_in_one_line
+from vertiwm_jax.world_model.choice import ModelName
+
+Policies = Callable[[TerrainMap], Mapping[str, Policy | Driver]]
+"""Policies that drive on any worlds of one kind of map."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One policy of the table."""
+
+    algorithm: Literal["ppo", "sac", "td3"]
+    """What trains it."""
+    model: ModelName
+    """What it is trained inside."""
+
+    def __str__(self) -> str:
+        return f"{self.algorithm} in {self.model}"
+
+
+@dataclass(frozen=True)
+class CompareConfig:
+    """Train policies by several algorithms in several models, and judge them all alike."""
+
+    rows: tyro.conf.Suppress[tyro.conf.Fixed[tuple[Row, ...]]]
+    """Which policies; in a file only."""
+    simulators: tuple[ModelName, ...] = ("builtin",)
+    """What they are judged in."""
+    suites: tuple[Suite, ...] = tuple(SUITES)
+    """Kinds of worlds that they are judged on."""
+    suite_worlds: int = 10
+    """How many worlds of each, with ten tasks each."""
+    seed: int = 0
+    """Draws the worlds; how policies are trained has seeds of its own."""
+    settings: Path | None = None
+    """Folder with `ppo.yaml`, `sac.yaml` and `td3.yaml`; those of the package by default."""
+    name: str = "compare"
+    """What the name of the run folder begins with; the date follows."""
+    runs: Path = Path("runs")
+    """Folder in which the folder of this run is made."""
+    resume: Path | None = None
+    """Folder of an earlier run to go on with; policies that are trained are not trained again."""
+
+    def __post_init__(self):
+        if not (self.rows and self.simulators):
+            raise ValueError("rows, simulators: expected at least one of each, found none")
+        if len(set(self.rows)) < len(self.rows):
+            raise ValueError("rows: expected each of them once, found one again")
+
+    @property
+    def grounds(self) -> GroundConfig:
+        """What is driven on."""
+        return GroundConfig(suites=self.suites, suite_worlds=self.suite_worlds)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; expected failures end in one line and a status that is not 0."""
+    program = "python -m vertiwm_jax.compare"
+    config = configuration.parse_resumable(CompareConfig, "table3", argv, program)
+    with failures_in_one_line(ConfigError):
+        settings = {row: training(config, row) for row in config.rows}
+        with _open(config) as run:
+            print(f"run folder {run.folder}", flush=True)
+            folders = {row: _train(row, settings[row], run.folder) for row in config.rows}
+            _judge_all(config, settings, folders, run.folder)
+
+
+def training(config: CompareConfig, row: Row) -> TrainConfig:
+    """How a policy is trained."""
+    folder, kind = config.settings, ALGORITHMS[row.algorithm]
+    file = folder / f"{kind.name}.yaml" if folder else configuration.default_config(kind.name)
+    return replace(configuration.load(kind, file), model=row.model, planning=None)
+
+
+def _open(config: CompareConfig) -> Run:
+    settings = replace(config, resume=None)
+    if config.resume is None:
+        return Run.create(config.runs, config.name, settings)
+    return Run.open(config.resume, 0, settings)
+
+
+def _train(row: Row, settings: TrainConfig, folder: Path) -> Path:
+    """The folder of the policy's training, which begins, or goes on from where it was."""
+    print(f"\n{row}", flush=True)
+    place = folder / str(row).replace(" ", "_")
+    begun = max(place.iterdir(), default=None) if place.is_dir() else None
+    if begun and (begun / "summary.json").is_file():
+        print(f"trained in {begun}", flush=True)
+        return begun
+    return policy_training.train_and_report(replace(settings, runs=place, resume=begun))
+
+
+def _judge_all(
+    config: CompareConfig, settings: dict[Row, TrainConfig], folders: dict[Row, Path], output: Path
+) -> None:
+    key = task.TaskConfig(seed=config.seed).key("worlds")
+    terrain = ground.suite_worlds(config.grounds, key)
+    first = settings[config.rows[0]]
+    rows = [(settings[row], _learned(row, settings[row], folders[row])) for row in config.rows]
+    rows.append((first, lambda _: baselines(first.navigation)))
+    judged = {}
+    for simulator in config.simulators:
+        judged[simulator] = _judge(config.grounds, rows, terrain, simulator)
+        radius = first.navigation.goal_radius
+        report.write(output / simulator, judged[simulator], REFERENCE, terrain, radius)
+    costs = {str(row): TrainingCost.of(folder) for row, folder in folders.items()}
+    table = policy_table.markdown(costs, judged)
+    print(f"\n{table}")
+    runs.write_atomic(output / "table.md", table + "\n")
+
+
+def _learned(row: Row, settings: TrainConfig, folder: Path) -> Policies:
+    """The policies of a training, by their names in the table."""
+
+    def restored(terrain: TerrainMap) -> dict[str, Policy | Driver]:
+        found = policy_training.learned(settings, terrain, folder)
+        return {name.replace(row.algorithm, str(row), 1): x for name, x in found.items()}
+
+    return restored
+
+
+def _judge(
+    grounds: GroundConfig,
+    rows: Sequence[tuple[TrainConfig, Policies]],
+    terrain: TerrainMap,
+    simulator: ModelName,
+) -> dict[str, Results]:
+    """Episodes of every policy, by suite."""
+    groups: dict[str, dict[str, NavigationResult]] = {}
+    for settings, policies in rows:
+        settings = replace(settings, ground=grounds)
+        test = task.test_environment(settings, terrain, simulator)
+        driven = report.drive(test.env, test.params, policies(terrain), settings.key("testing"))
+        for suite, results in driven.items():
+            groups.setdefault(suite, {}).update(results)
+    return dict(groups)
+
+
+if __name__ == "__main__":
+    main()
