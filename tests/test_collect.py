@@ -233,3 +233,13 @@ def test_a_policy_drives_from_goal_to_goal(maps):
         np.testing.assert_array_equal(pilot(state), command)
         state = np.append(goal, np.zeros(9)).astype(np.float32)
     assert np.linalg.norm(np.diff(goals, axis=0), axis=-1).min() >= 20
+    command = collect.Collect(output=maps, seconds=2.0)
+    task = collect.Task(command, (policy, config), collect._single(terrain, 0), 0, drive=1)
+    drive = collect.record(task)
+    assert drive.control.shape == (20, 2) and np.all(drive.control[:, 0] == 2.5)
+
+
+@pytest.mark.slow
+def test_several_processes_record_the_same(collected, maps, tmp_path):
+    run(maps, tmp_path / "drives", "--jobs", "2")
+    jax.tree.map(np.testing.assert_array_equal, contents(tmp_path / "drives"), contents(collected))

@@ -158,15 +158,16 @@ def record(task: Task) -> Drive:
     `SimulatorError` if none of them does a single step.
     """
     command, tries = task.command, []
-    simulator = SIMULATORS[command.simulator](task.terrain)
+    terrain = jax.device_put(task.terrain)
+    simulator = SIMULATORS[command.simulator](terrain)
     for attempt in range(ATTEMPTS):
         rng = np.random.default_rng([command.seed, task.world, task.drive, attempt])
-        start = pilots.start(rng, task.terrain, command.seconds)
+        start = pilots.start(rng, terrain, command.seconds)
         if task.learned:
-            pilot = pilots.Learned(*task.learned, task.terrain, rng)
+            pilot = pilots.Learned(*task.learned, terrain, rng)
         else:
             pilot = pilots.sinusoids(rng, command.steps)
-        tries.append(recording.record(simulator, task.terrain, start, pilot, command.steps))
+        tries.append(recording.record(simulator, terrain, start, pilot, command.steps))
         if len(tries[-1].control) >= SHORTEST * command.steps:
             break
     longest = max(tries, key=lambda drive: len(drive.control))
