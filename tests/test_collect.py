@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from doors import refusal
 
-from vertiwm_jax import collect, runs
+from vertiwm_jax import collect, evaluate, runs
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.learning.dataset import Auxiliary
@@ -135,6 +135,8 @@ def test_chrono_that_is_missing_is_named(tmp_path, monkeypatch):
     message = refusal(collect.main, "--output", tmp_path / "drives", "--simulator", "chrono")
     assert "conda install -c projectchrono" in message and "PyPI is something else" in message
     assert not (tmp_path / "drives").exists()
+    navigate = ("navigation", "--policy", "straight", "--simulator", "chrono")
+    assert refusal(evaluate.main, *navigate) == message
 
 
 def test_drives_that_end_early_are_tried_again(maps, monkeypatch):
