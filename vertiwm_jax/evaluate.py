@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +14,7 @@ from vertiwm_jax import policy_training
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.evaluation import prediction, prediction_report, report
+from vertiwm_jax.evaluation import navigation, outside, prediction, prediction_report, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.fit import FitConfig
@@ -26,6 +27,9 @@ from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.ground import Suite
 from vertiwm_jax.runs import RunError
 from vertiwm_jax.sac import SACTraining
+from vertiwm_jax.simulators import chrono
+from vertiwm_jax.simulators.chrono import Chrono
+from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.td3 import TD3Training
 from vertiwm_jax.world_model.choice import ModelName, choose, fitted
 from vertiwm_jax.world_model.nesam import SoilSource
@@ -77,8 +81,8 @@ class Navigation:
 
     policy: Literal["straight", "random"] | Path
     """Folder of a training run, or a controller that has learned nothing."""
-    simulator: ModelName = "builtin"
-    """What moves the vehicle."""
+    simulator: ModelName | Literal["chrono"] = "builtin"
+    """What moves the vehicle; Chrono needs PyChrono, and drives one task after the other."""
     worlds: Path | None = None
     """A Verti-Bench checkout or a folder of .npz maps, to drive on all of them."""
     obstacles: bool = False
@@ -114,7 +118,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     try:
         _predict(command) if isinstance(command, Prediction) else _navigate(command)
-    except (RunError, CheckpointError, ConfigError, OSError) as error:
+    except (RunError, SimulatorError, CheckpointError, ConfigError, OSError) as error:
         sys.exit(f"error: {error}")
 
 
@@ -149,13 +153,16 @@ def _compared(folders: Sequence[Path]) -> dict[str, tuple[Dynamics, Params]]:
 
 
 def _navigate(command: Navigation) -> None:
+    if command.simulator == "chrono":
+        chrono.modules()
     run = command.policy if isinstance(command.policy, Path) else None
     file = run / "config.yaml" if run else configuration.default_config("ppo")
     try:
         config = _adapted(training(file), command)
         maps = command.worlds
         terrain = ground.load(config.ground, maps) if maps else task.held_out(config)
-        test = task.test_environment(config, terrain, command.simulator)
+        model = "builtin" if command.simulator == "chrono" else command.simulator
+        test = task.test_environment(config, terrain, model)
     except ValueError as error:  # what is wrong with configuration, maps, or tasks on them
         sys.exit(f"error: {error}")
     policies = baselines(config.navigation)
@@ -163,7 +170,10 @@ def _navigate(command: Navigation) -> None:
         policies = policy_training.learned(config, terrain, run) | policies
     elif command.policy == "straight":
         policies = {REFERENCE: policies[REFERENCE]}
-    groups = report.drive(test.env, test.params, policies, config.key("testing"))
+    judge = navigation.evaluate
+    if command.simulator == "chrono":
+        judge = partial(outside.evaluate, Chrono, ground.test_tasks(config.ground, terrain))
+    groups = report.drive(test.env, test.params, policies, config.key("testing"), judge)
     print(f"\n{report.markdown(groups, REFERENCE)}")
     if command.output:
         radius = config.navigation.goal_radius

@@ -5,7 +5,7 @@ import dataclasses
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.map import TerrainMap
 
 Results = Mapping[str, NavigationResult]
+Judge = Callable[[NavigationEnv, NavigationParams, Policy | Driver, jax.Array], NavigationResult]
 
 
 def drive(
@@ -35,10 +36,11 @@ def drive(
     params: NavigationParams,
     policies: Mapping[str, Policy | Driver],
     key: jax.Array,
+    judge: Judge = evaluate,
 ) -> dict[str, Results]:
     """Drives all tasks of the pool with each policy; the results by suite."""
     print(f"driving {params.pool_size} tasks on {params.terrain.worlds} worlds ...", flush=True)
-    results = {name: evaluate(env, params, policy, key) for name, policy in policies.items()}
+    results = {name: judge(env, params, policy, key) for name, policy in policies.items()}
     return by_suite(results, ground.suites(params.terrain))
 
 

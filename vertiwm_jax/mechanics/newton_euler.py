@@ -67,6 +67,13 @@ def advance_twist(
     return Twist(twist.linear.plus(linear), twist.angular.plus(angular))
 
 
+def applied(contact: ContactForce, before: Twist, after: Twist) -> Vector:
+    """Forces `[C]` that took the twist from `before` to `after`, N, in the axes it had before."""
+    gained = velocity_at(after, contact.arm).plus(velocity_at(before, contact.arm), -1.0)
+    lost = contact.damping * gained.dot(contact.direction)
+    return contact.direction.times(contact.force - lost)
+
+
 def turned(twist: Twist, inertia: Vector, turn: Axes) -> Twist:
     """A free body's twist in its axes after they have turned by `turn`.
 

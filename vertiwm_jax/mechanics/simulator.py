@@ -19,6 +19,7 @@ from vertiwm_jax.mechanics.newton_euler import (
     ContactForce,
     Twist,
     advance_twist,
+    applied,
     turned,
     velocity_at,
 )
@@ -105,6 +106,14 @@ class SimulatorHistory:
     force: jax.Array
 
 
+class GroundForces(NamedTuple):
+    """What the ground did in sub-steps `[...]`: force on the wheels `[..., 4, 3]` and on the hull
+    `[..., 3]`, N, world frame."""
+
+    wheels: jax.Array
+    hull: jax.Array
+
+
 class _Body(NamedTuple):
     """Pose and twist of the chassis while it is integrated."""
 
@@ -146,6 +155,17 @@ class Simulator:
         state: VehicleState,
         command: Command,
     ) -> tuple[VehicleState, SimulatorHistory]:
+        return self.step_with_forces(params, terrain, history, state, command)[:2]
+
+    def step_with_forces(
+        self,
+        params: SimulatorParams,
+        terrain: TerrainMap,
+        history: SimulatorHistory,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, SimulatorHistory, GroundForces]:
+        """`step`, and the forces in each of its sub-steps, leaves `[substeps, ...]`."""
         centre = Vector.of(params.vehicle.centre_of_mass)
         angular = Vector.of(state.angular_velocity)
         linear = Vector.of(state.velocity).plus(angular.cross(centre))
@@ -154,18 +174,23 @@ class Simulator:
 
         def substep(
             carry: tuple[_Body, SimulatorHistory], _: None
-        ) -> tuple[tuple[_Body, SimulatorHistory], None]:
+        ) -> tuple[tuple[_Body, SimulatorHistory], GroundForces]:
             seconds = STEP_SECONDS / self.substeps
-            return _substep(params, terrain, *carry, command, seconds), None
+            body, history, forces = _substep(params, terrain, *carry, command, seconds)
+            return (body, history), forces
 
-        (body, history), _ = jax.lax.scan(substep, (body, history), None, length=self.substeps)
+        (body, history), forces = jax.lax.scan(substep, (body, history), None, length=self.substeps)
         linear, angular = body.twist
-        return VehicleState(
-            position=body.position.stacked(),
-            rpy=geometry.rpy_from_rotation(jaxlie.SO3(body.quaternion)),
-            velocity=linear.plus(angular.cross(centre), -1.0).stacked(),
-            angular_velocity=angular.stacked(),
-        ), history
+        return (
+            VehicleState(
+                position=body.position.stacked(),
+                rpy=geometry.rpy_from_rotation(jaxlie.SO3(body.quaternion)),
+                velocity=linear.plus(angular.cross(centre), -1.0).stacked(),
+                angular_velocity=angular.stacked(),
+            ),
+            history,
+            forces,
+        )
 
 
 def _substep(
@@ -175,7 +200,7 @@ def _substep(
     history: SimulatorHistory,
     command: Command,
     seconds: float,
-) -> tuple[_Body, SimulatorHistory]:
+) -> tuple[_Body, SimulatorHistory, GroundForces]:
     vehicle = params.vehicle
     axes = Axes.from_quaternion(body.quaternion)
     centre = Vector.of(vehicle.centre_of_mass)
@@ -241,7 +266,9 @@ def _substep(
         wheels=wheels,
         force=jnp.stack([load, traction, ground.lateral], axis=-1),
     )
-    return _advance_pose(vehicle, body, axes, centre, twist, seconds), history
+    forces = [axes.to_world(applied(contact, body.twist, twist)).stacked() for contact in contacts]
+    on_ground = GroundForces(sum(forces[1:3], forces[0]), sum(forces[4:], forces[3])[0])
+    return _advance_pose(vehicle, body, axes, centre, twist, seconds), history, on_ground
 
 
 class _Press(NamedTuple):

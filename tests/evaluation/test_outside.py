@@ -1,0 +1,44 @@
+"""A policy is judged outside jit as it is inside."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from env.worlds import SNOW, hills
+
+from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
+from vertiwm_jax.env.tasks import Tasks
+from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.evaluation import navigation, outside
+from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.simulators.builtin import BuiltIn
+from vertiwm_jax.terrain import map as terrain_map
+
+
+def test_the_built_in_simulator_outside_jit_is_that_inside():
+    semantic = np.full((16, 16), SNOW)
+    semantic[:, 8:] = 0
+    box = np.array([[15.0, -30.0, 4, 4, 3]])
+    terrain = terrain_map.build(hills(), semantic, obstacles=box)
+    tasks = Tasks(
+        world=jnp.zeros(3, jnp.int32),
+        start=jnp.array([[-20.0, 0.0], [0.0, -30.0], [50.0, 0.0]]),
+        yaw=jnp.array([0.3, 0.0, 1.0]),
+        goal=jnp.array([[0.0, 0.0], [30.0, -30.0], [-50.0, 0.0]]),
+    )
+    config = NavigationConfig(speed_range=(0.0, 5.0), horizon_seconds=6.0)
+    env = NavigationEnv(Simulator(), config)
+    params = env.make_params(chrono_like(hmmwv()), terrain, tasks)
+    arguments = env, params, jax.tree_util.Partial(full_speed), jax.random.key(0)
+    inside, found = navigation.evaluate(*arguments), outside.evaluate(BuiltIn, tasks, *arguments)
+    assert found.ending.tolist() == [Ending.GOAL, Ending.COLLIDED, Ending.TIMED_OUT]
+    for name in ("ending", "steps", "world"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(inside, name))
+    for name in ("position", "rpy", "abs_roll", "abs_pitch", "driven", "final_distance"):
+        ours, theirs = getattr(found, name), getattr(inside, name)
+        np.testing.assert_allclose(ours, theirs, atol=1e-2, err_msg=name)
+
+
+def full_speed(observation, key):
+    """Straight on."""
+    return jnp.array([1.0, 0.0])

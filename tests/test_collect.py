@@ -1,0 +1,247 @@
+"""Recorded drives: the command, what it writes, and what is left when it is stopped."""
+
+import io
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from doors import refusal
+
+from vertiwm_jax import collect, evaluate, runs
+from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.learning import dataset, schema
+from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.simulators import chrono, pilots, recording
+from vertiwm_jax.simulators.protocol import Observation, SimulatorError
+from vertiwm_jax.terrain import files
+from vertiwm_jax.terrain import map as terrain_map
+
+GRASS, SAND = 3, 8
+STEPS = 6
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory):
+    """A folder of two worlds, hilly and in part sand."""
+    folder = tmp_path_factory.mktemp("maps")
+    wave = np.sin(np.arange(129) / 8)
+    semantic = np.full((16, 16), GRASS)
+    semantic[:, 8:] = SAND
+    for i in range(2):
+        heights = 4 + i * np.outer(wave, wave)
+        files.save(terrain_map.build(heights, semantic), folder / f"map_{i}.npz")
+    return folder
+
+
+def run(maps, output, *argv):
+    arguments = ["--output", output, "--worlds", maps, "--drives", 23, "--seconds", STEPS / 10]
+    collect.main([*map(str, arguments), *argv])
+
+
+@pytest.fixture(scope="module")
+def collected(maps, tmp_path_factory):
+    output = tmp_path_factory.mktemp("collected") / "drives"
+    run(maps, output)
+    return output
+
+
+def contents(folder):
+    """The arrays of every file."""
+    return {
+        path.name: {name: array for name, array in np.load(path).items()}
+        for path in sorted(folder.glob("*.npz"))
+    }
+
+
+def test_drives_are_read_as_recorded(collected, maps):
+    drives, terrain = dataset.load(collected, "train")
+    assert drives.state.shape == (40, STEPS + 1, 12) and terrain.worlds == 2
+    assert np.all(drives.length == STEPS)
+    np.testing.assert_array_equal(terrain.elevation, files.load(maps).elevation)
+    assert all(getattr(drives.auxiliary, name) is not None for name in schema.AUXILIARY)
+    assert set(np.unique(drives.wheel_class)) == {GRASS, SAND}
+    control = drives.control.reshape(-1, 2)
+    assert 1 <= control[:, 0].min() < control[:, 0].max() <= 4
+    assert 0.2 < np.abs(control[:, 1]).max() <= 0.3726
+    _, meta = schema.read(collected / "world_001.npz")
+    assert (meta["map"], meta["world"], meta["simulator"]) == ("world_001.npz", 1, "builtin")
+    # No two drives are the same.
+    assert len(np.unique(drives.state[:, 0, 0])) == 40
+    assert len(dataset.load(collected, "test")[0].state) == 2
+
+
+def test_going_on_is_as_if_never_stopped(collected, maps, tmp_path, monkeypatch, capsys):
+    archive, left = recording.archive, []
+
+    def stopping(drives, steps, meta):
+        if meta["world"] == 1:
+            left.extend(path.name for path in (tmp_path / "drives").iterdir())
+            raise KeyboardInterrupt
+        return archive(drives, steps, meta)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as stop:
+        patch.setattr(recording, "archive", stopping)
+        run(maps, tmp_path / "drives")
+    assert stop.value.code == 130
+    assert sorted(left) == ["config.yaml", "maps", "world_000.npz"]
+    before = (tmp_path / "drives" / "world_000.npz").stat().st_mtime_ns
+    run(maps, tmp_path / "drives")
+    assert "1 of 2 worlds are left" in capsys.readouterr().out
+    assert (tmp_path / "drives" / "world_000.npz").stat().st_mtime_ns == before
+    jax.tree.map(np.testing.assert_array_equal, contents(tmp_path / "drives"), contents(collected))
+
+
+def test_what_cannot_be_written_leaves_nothing_half_written(maps, tmp_path, monkeypatch):
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    run_folder = tmp_path / "drives"
+    write = runs.write_atomic
+
+    def write_on_a_full_disk(path, data):
+        with monkeypatch.context() as patch:
+            if path.name == "world_000.npz":
+                patch.setattr(runs.os, "fsync", full)
+            write(path, data)
+
+    monkeypatch.setattr(runs, "write_atomic", write_on_a_full_disk)
+    argv = ("--output", run_folder, "--worlds", maps, "--drives", 1, "--seconds", 0.1)
+    assert "No space left" in refusal(collect.main, *argv)
+    assert sorted(path.name for path in run_folder.iterdir()) == ["config.yaml", "maps"]
+
+
+def test_another_command_does_not_go_on(collected, maps, tmp_path):
+    argv = ("--output", collected, "--worlds", maps, "--seconds", STEPS / 10)
+    message = refusal(collect.main, *argv, "--drives", 22)
+    assert message.endswith("config.yaml: drives: expected 23 as before, found 22")
+    (tmp_path / "file").touch()
+    message = refusal(collect.main, "--output", tmp_path, "--worlds", maps)
+    assert "expected a new folder" in message
+    assert "none: file: expected" in refusal(
+        collect.main, "--output", tmp_path, "--worlds", maps / "none"
+    )
+    with pytest.raises(SystemExit) as stop:
+        collect.main(["--output", str(tmp_path), "--obstacles", "True"])
+    assert stop.value.code == 2
+
+
+def test_chrono_that_is_missing_is_named(tmp_path, monkeypatch):
+    def missing(name):
+        raise ImportError(f"No module named {name!r}")
+
+    monkeypatch.setattr(chrono.importlib, "import_module", missing)
+    message = refusal(collect.main, "--output", tmp_path / "drives", "--simulator", "chrono")
+    assert "conda install -c projectchrono" in message and "PyPI is something else" in message
+    assert not (tmp_path / "drives").exists()
+    navigate = ("navigation", "--policy", "straight", "--simulator", "chrono")
+    assert refusal(evaluate.main, *navigate) == message
+
+
+def test_drives_that_end_early_are_tried_again(maps, monkeypatch):
+    lengths, tried = iter([1, 3, 2, 0, 1, 2, 0, 0, 0, 0, 0, 0]), []
+
+    def short(simulator, terrain, start, pilot, steps):
+        tried.append(start)
+        return recording.Drive([], np.zeros((next(lengths), 2)), "rolled over")
+
+    monkeypatch.setattr(recording, "record", short)
+    command = collect.Collect(output=maps, seconds=1.0)
+    task = collect.Task(command, None, files.load(maps), world=0, drive=0)
+    assert len(collect.record(task).control) == 3 and len(set(tried)) == 6
+    with pytest.raises(SimulatorError, match="world 0: drive 0: expected a step or more"):
+        collect.record(task)
+
+
+class Scripted:
+    """Goes through states whatever is commanded."""
+
+    def __init__(self, states):
+        self._states = iter(states)
+
+    def start(self, x, y, yaw):
+        return self.step(np.zeros(2))
+
+    def step(self, command):
+        state = np.asarray(next(self._states), np.float32)
+        return Observation(state, np.zeros(4, np.uint8), Auxiliary())
+
+
+@pytest.mark.parametrize(
+    ("index", "value", "ending", "length"),
+    [
+        (0, 61.5, "left the map", 3),
+        (3, 1.4, "rolled over", 3),
+        (6, np.nan, "diverged", 2),
+        (7, 60.0, "diverged", 2),
+        (0, 60.0, "time", 5),
+    ],
+)
+def test_endings(maps, index, value, ending, length):
+    states = np.zeros((6, 12))
+    states[3:, index] = value
+    level = files.load(maps / "map_0.npz")
+    pilot = pilots.sinusoids(np.random.default_rng(0), 5)
+    drive = recording.record(Scripted(states), level, (0, 0, 0), pilot, 5)
+    assert (drive.ending, len(drive.control), len(drive.observations)) == (
+        ending, length, length + 1,
+    )  # fmt: skip
+    file = np.load(io.BytesIO(recording.archive([drive], 5, {"map": "a"})))
+    assert file["length"] == [length] and file["state"].shape == (1, 6, 12)
+    assert json.loads(str(file["meta"]))["dt"] == 0.1
+
+
+def test_starts_are_level_roomy_and_near_borders(maps):
+    boxes = np.stack([np.zeros(16), np.linspace(-60, 60, 16), *np.ones((3, 16))], -1)
+    steep = np.broadcast_to(np.maximum(np.arange(129.0) - 100, 0) * 0.5, (129, 129))
+    semantic = np.full((16, 16), GRASS)
+    semantic[:, 6:8] = SAND
+    terrain = terrain_map.build(steep, semantic, obstacles=boxes)
+    for seed in range(20):
+        x, y, yaw = pilots.start(np.random.default_rng(seed), terrain, 16.0)
+        assert abs(x) <= 59 and abs(y) <= 59 and x < 38
+        assert np.hypot(boxes[:, 0] - x, boxes[:, 1] - y).min() >= 8
+        end = np.array([x, y]) + 39 * np.array([np.cos(yaw), np.sin(yaw)])
+        assert np.all(np.abs(end) <= 59.1)
+        way = np.linspace(x, end[0], 50)
+        assert 0.05 < np.mean((way > -16) & (way < 0)) < 0.95
+    slope = np.broadcast_to(0.4 * np.arange(65.0), (65, 65))
+    steep = terrain_map.build(slope, np.full((8, 8), GRASS), elevation_range=(0, 64))
+    with pytest.raises(SimulatorError, match="20 degrees or less"):
+        pilots.start(np.random.default_rng(0), steep, 16.0)
+
+
+class AtGoal:
+    """Asks for half speed, and steers by the bearing of the goal."""
+
+    def __call__(self, observation, key):
+        return jnp.stack([0.0 * observation[8], observation[10]])
+
+
+def test_a_policy_drives_from_goal_to_goal(maps):
+    terrain, config = files.load(maps / "map_0.npz"), NavigationConfig(speed_range=(0.0, 5.0))
+    policy = jax.tree_util.Partial(AtGoal())
+    pilot = pilots.Learned(policy, config, terrain, np.random.default_rng(0))
+    state, goals = np.zeros(12, np.float32), []
+    for _ in range(3):
+        command = pilot(state)
+        goal = pilot._goal
+        assert goal is not None
+        goals.append(goal)
+        offset = goal - state[:3]
+        bearing = np.arctan2(offset[1], offset[0]) - state[5]
+        np.testing.assert_allclose(command, [2.5, 0.3725 * np.sin(bearing)], atol=1e-3)
+        np.testing.assert_array_equal(pilot(state), command)
+        state = np.append(goal, np.zeros(9)).astype(np.float32)
+    assert np.linalg.norm(np.diff(goals, axis=0), axis=-1).min() >= 20
+    command = collect.Collect(output=maps, seconds=2.0)
+    task = collect.Task(command, (policy, config), collect._single(terrain, 0), 0, drive=1)
+    drive = collect.record(task)
+    assert drive.control.shape == (20, 2) and np.all(drive.control[:, 0] == 2.5)
+
+
+@pytest.mark.slow
+def test_several_processes_record_the_same(collected, maps, tmp_path):
+    run(maps, tmp_path / "drives", "--jobs", "2")
+    jax.tree.map(np.testing.assert_array_equal, contents(tmp_path / "drives"), contents(collected))

@@ -1,0 +1,256 @@
+"""`python -m vertiwm_jax.collect`: record drives in a simulator, to fit and to test models on."""
+
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from itertools import islice
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+import tyro
+
+from vertiwm_jax import config as configuration
+from vertiwm_jax import export, runs
+from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.config import ConfigError
+from vertiwm_jax.env.driver import Policy
+from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.evaluate import training
+from vertiwm_jax.rl import ground
+from vertiwm_jax.rl.ground import GroundConfig
+from vertiwm_jax.runs import Progress, RunError
+from vertiwm_jax.simulators import chrono, pilots, recording
+from vertiwm_jax.simulators.builtin import BuiltIn
+from vertiwm_jax.simulators.chrono import Chrono
+from vertiwm_jax.simulators.protocol import SimulatorError
+from vertiwm_jax.simulators.recording import Drive
+from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain import files, worlds
+from vertiwm_jax.terrain.map import MapError, TerrainMap
+from vertiwm_jax.terrain.worlds import Difficulty, Kind, WorldConfig
+
+SIMULATORS = {"builtin": BuiltIn, "chrono": Chrono}
+SHORTEST = 0.8
+"""Share of its time after which a drive that ended early is kept; others are tried again."""
+ATTEMPTS = 6
+
+
+@dataclass(frozen=True)
+class Collect:
+    """Record drives of an HMMWV in a simulator as `fit` and `evaluate` read them, a file a world.
+
+    The same command goes on where it was stopped: worlds whose file is there are not driven again.
+    """
+
+    output: Path
+    """Folder for the files; their maps are in its folder `maps`."""
+    simulator: Literal["builtin", "chrono"] = "builtin"
+    """What moves the vehicle; Chrono needs PyChrono."""
+    worlds: Path | None = None
+    """A Verti-Bench checkout or a folder of .npz maps, to drive on all of them."""
+    obstacles: bool = False
+    """Whether the rocks and trees of these maps stand there, in Chrono."""
+    kinds: tuple[Kind, ...] = ("rigid", "deformable", "mixed")
+    """Ground of procedural worlds, unless maps are given."""
+    difficulties: tuple[Difficulty, ...] = ("low", "mid", "high")
+    """How steep they are; there is one world of each kind and difficulty."""
+    repeats: int = 1
+    """How many of each."""
+    drives: int = 25
+    """Drives on each world; `fit` learns from the first 20, and tests on 22 to 24."""
+    seconds: float = 25.0
+    """Duration of a drive."""
+    policy: Path | None = None
+    """Run folder of a policy that drives from goal to goal; the paper's sinusoids by default."""
+    seed: int = 0
+    """Decides everything that is random."""
+    jobs: int = 1
+    """Processes that simulate."""
+
+    def __post_init__(self):
+        for name in ("drives", "jobs", "repeats"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
+        if not self.seconds >= STEP_SECONDS:
+            raise ValueError(f"seconds: expected {STEP_SECONDS} or more, found {self.seconds}")
+        if self.obstacles and not (self.worlds and self.simulator == "chrono"):
+            raise ValueError("obstacles: are solid in Chrono alone, and are those of given worlds")
+        WorldConfig(self.difficulties, self.kinds)
+
+    @property
+    def steps(self) -> int:
+        """Steps of a drive that is not ended early."""
+        return round(self.seconds / STEP_SECONDS)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One drive to record: number `drive` on the selected world of `terrain`, number `world`."""
+
+    command: Collect
+    learned: tuple[Policy, NavigationConfig] | None
+    terrain: TerrainMap
+    world: int
+    drive: int
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; expected failures end in one line and a status that is not 0."""
+    command = tyro.cli(
+        Collect,
+        args=argv,
+        prog="python -m vertiwm_jax.collect",
+        config=(tyro.conf.FlagConversionOff,),
+    )
+    try:
+        collect(command)
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on with the worlds that are left")
+        sys.exit(130)
+    except BrokenProcessPool:
+        sys.exit("error: a process that simulated was killed; the same command goes on")
+    except (SimulatorError, RunError, CheckpointError, ConfigError, MapError, OSError) as error:
+        sys.exit(f"error: {error}")
+    print(f"the drives are in {command.output}; to fit the world model to them:")
+    print(f"python -m vertiwm_jax.fit --data {command.output}")
+
+
+def collect(command: Collect) -> None:
+    """Records what the folder lacks, a world after the other."""
+    if command.simulator == "chrono":
+        chrono.modules()
+    terrain, learned = _terrain(command), _learned(command.policy)
+    _claim(command)
+    missing = [w for w in range(terrain.worlds) if not _file(command, w).exists()]
+    tasks = (
+        Task(command, learned, alone, world, drive)
+        for world in missing
+        for alone in [_single(terrain, world)]
+        for drive in range(command.drives)
+    )
+    total = len(missing) * command.drives * command.steps
+    print(f"{len(missing)} of {terrain.worlds} worlds are left", flush=True)
+    began, done = time.monotonic(), 0
+    with _simulating(command.jobs) as mapped, Progress(total, "steps") as progress:
+        found = mapped(record, tasks)
+        for world in missing:
+            drives = []
+            for drive in islice(found, command.drives):
+                drives.append(drive)
+                done += len(drive.control)
+                progress.advance(command.steps, f"world {world}, drive {len(drives)}")
+            _write(command, world, _single(terrain, world), drives)
+    if done:
+        print(f"{done:,} steps, {done / (time.monotonic() - began):,.0f} a second")
+
+
+def record(task: Task) -> Drive:
+    """The longest of a few attempts, of which the first that lasts is the last.
+
+    `SimulatorError` if none of them does a single step.
+    """
+    command, tries = task.command, []
+    terrain = jax.device_put(task.terrain)
+    simulator = SIMULATORS[command.simulator](terrain)
+    for attempt in range(ATTEMPTS):
+        rng = np.random.default_rng([command.seed, task.world, task.drive, attempt])
+        start = pilots.start(rng, terrain, command.seconds)
+        if task.learned:
+            pilot = pilots.Learned(*task.learned, terrain, rng)
+        else:
+            pilot = pilots.sinusoids(rng, command.steps)
+        tries.append(recording.record(simulator, terrain, start, pilot, command.steps))
+        if len(tries[-1].control) >= SHORTEST * command.steps:
+            break
+    longest = max(tries, key=lambda drive: len(drive.control))
+    if not len(longest.control):
+        raise SimulatorError(
+            f"world {task.world}: drive {task.drive}: expected a step or more, found none in "
+            f"{ATTEMPTS} attempts ({longest.ending})"
+        )
+    return longest
+
+
+@contextmanager
+def _simulating(jobs: int) -> Iterator[Callable[..., Iterator[Any]]]:
+    """`map`, in this process or in several."""
+    if jobs == 1:
+        yield map
+        return
+    # Not forked: JAX has threads. Ctrl-C is for this process, which then ends the others.
+    ignore = signal.SIGINT, signal.SIG_IGN
+    executor = ProcessPoolExecutor(jobs, get_context("spawn"), signal.signal, ignore)
+    try:
+        yield executor.map
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _terrain(command: Collect) -> TerrainMap:
+    """All worlds to drive on."""
+    if command.worlds:
+        return ground.load(GroundConfig(obstacles=command.obstacles), command.worlds)
+    config = WorldConfig(command.difficulties, command.kinds)
+    count = command.repeats * len(command.difficulties) * len(command.kinds)
+    return worlds.generate(jax.random.split(jax.random.key(command.seed), count), config)
+
+
+def _single(terrain: TerrainMap, world: int) -> TerrainMap:
+    """One of the worlds alone, in host memory."""
+    stacked = ("elevation", "semantic", "friction", "obstacles")
+    alone = {name: getattr(terrain, name)[world : world + 1] for name in stacked}
+    return jax.device_get(replace(terrain, **alone))
+
+
+def _learned(run: Path | None) -> tuple[Policy, NavigationConfig] | None:
+    """What the run has learned, in host memory, and how it is to be driven."""
+    if run is None:
+        return None
+    config = training(run / "config.yaml")
+    return jax.device_get(export.restore(config, run, seed=0)), config.navigation
+
+
+def _claim(command: Collect) -> None:
+    """Notes in the folder what it is made by; `ConfigError` if it was made by something else."""
+    file = command.output / "config.yaml"
+    settings = replace(command, output=Path("."), jobs=1)
+    if not file.exists():
+        if command.output.is_dir() and any(command.output.iterdir()):
+            raise ConfigError(f"{file}: expected a new folder, or one of this command")
+        (command.output / "maps").mkdir(parents=True, exist_ok=True)
+        runs.write_atomic(file, configuration.dump(settings))
+    before = configuration.load(Collect, file)
+    for name in (field.name for field in fields(Collect)):
+        was, asked = getattr(before, name), getattr(settings, name)
+        if was != asked:
+            raise ConfigError(f"{file}: {name}: expected {was} as before, found {asked}")
+
+
+def _file(command: Collect, world: int) -> Path:
+    return command.output / f"world_{world:03d}.npz"
+
+
+def _write(command: Collect, world: int, terrain: TerrainMap, drives: list[Drive]) -> None:
+    """The map, and then the drives, by which a world counts as done."""
+    path = _file(command, world)
+    files.save(terrain, path.parent / "maps" / path.name)
+    meta = {
+        "map": path.name,
+        "simulator": command.simulator,
+        "policy": str(command.policy) if command.policy else "sinusoids",
+        "world": world,
+        "seed": command.seed,
+    }
+    runs.write_atomic(path, recording.archive(drives, command.steps, meta))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""How well a policy drives in a simulator outside jit: the same task, one episode at a time."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vertiwm_jax.env.driver import Driver, Memory, Policy, Reactive
+from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
+from vertiwm_jax.env.tasks import Tasks
+from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.evaluation.navigation import NavigationResult
+from vertiwm_jax.runs import Progress
+from vertiwm_jax.simulators.protocol import Simulator
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain.map import TerrainMap
+
+
+@dataclass(frozen=True)
+class Followed:
+    """The dynamics of a vehicle that something else moves; parameters: `[12]` its next state."""
+
+    def init(self, params: jax.Array, terrain: TerrainMap, state: VehicleState) -> tuple[()]:
+        return ()
+
+    def step(
+        self,
+        params: jax.Array,
+        terrain: TerrainMap,
+        history: tuple[()],
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, tuple[()]]:
+        return VehicleState.from_vector(params), ()
+
+
+def evaluate(
+    simulator: Callable[[TerrainMap], Simulator],
+    tasks: Tasks,
+    env: NavigationEnv,
+    params: NavigationParams,
+    policy: Policy | Driver,
+    key: jax.Array,
+) -> NavigationResult:
+    """As `navigation.evaluate`, with the vehicle in `simulator` on the world of each task.
+
+    tasks: of which `params` has the starts.
+    """
+    env = replace(env, dynamics=Followed())
+    driver = policy if isinstance(policy, Driver) else Reactive(policy)
+    episodes = []
+    with Progress(params.pool_size, "episodes") as progress:
+        for i in range(params.pool_size):
+            task = jax.tree.map(lambda x, i=i: x[i], jax.device_get(tasks))
+            vehicle = simulator(params.terrain.select(task.world))
+            x, y = task.start.tolist()
+            seen = vehicle.start(x, y, float(task.yaw))
+            start = jax.tree.map(lambda x, i=i: x[i], params.starts)
+            begin = VehicleState.from_vector(jnp.asarray(seen.state))
+            start = replace(start, vehicle=begin, history=())
+            own = jax.random.fold_in(key, i)
+            episodes.append(_episode(vehicle, env, params, driver, start, own))
+            progress.advance()
+    return jax.tree.map(lambda *x: jnp.stack(x), *episodes)
+
+
+def _episode(
+    simulator: Simulator,
+    env: NavigationEnv,
+    params: NavigationParams,
+    driver: Driver,
+    state: NavigationState,
+    key: jax.Array,
+) -> NavigationResult:
+    """One episode, leaves without the axis of tasks."""
+    observation = env.observe(None, state, None, params)
+    memory, length = driver.start(params, state), int(params.max_steps_in_episode)
+    path = [np.concatenate([state.vehicle.position, state.vehicle.rpy])]
+    while state.ending == Ending.RUNNING:
+        step = len(path) - 1
+        deciding, acting = jax.random.split(jax.random.fold_in(key, step))
+        if step % driver.interval == 0:
+            memory = _decide(driver, params, memory, observation, state, deciding)
+        action, memory = _act(driver, params, memory, observation, state, acting)
+        seen = simulator.step(np.asarray(env.config.command(action).vector))
+        moved = replace(params, dynamics=jnp.asarray(seen.state))
+        observation, state = _follow(env, moved, state, action, acting)
+        path.append(np.concatenate([state.vehicle.position, state.vehicle.rpy]))
+    poses = np.stack(path)
+    tilt = np.abs(poses[1:, 3:5]).mean(axis=0)
+    filled = np.pad(poses, [(0, length + 1 - len(poses)), (0, 0)], "edge")
+    return NavigationResult(
+        ending=state.ending,
+        steps=jnp.asarray(state.time),
+        abs_roll=jnp.asarray(tilt[0]),
+        abs_pitch=jnp.asarray(tilt[1]),
+        driven=jnp.asarray(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=-1).sum()),
+        final_distance=jnp.linalg.norm(state.goal - state.vehicle.position),
+        world=state.world,
+        goal=state.goal,
+        position=jnp.asarray(filled[:, :3]),
+        rpy=jnp.asarray(filled[:, 3:]),
+    )
+
+
+@jax.jit
+def _decide(driver: Driver, params: NavigationParams, memory: Memory, *rest: Any) -> Memory:
+    return driver.decide(params, memory, *rest)
+
+
+@jax.jit
+def _act(
+    driver: Driver, params: NavigationParams, memory: Memory, *rest: Any
+) -> tuple[jax.Array, Memory]:
+    return driver.act(params, memory, *rest)
+
+
+@partial(jax.jit, static_argnames="env")
+def _follow(
+    env: NavigationEnv,
+    params: NavigationParams,
+    state: NavigationState,
+    action: jax.Array,
+    key: jax.Array,
+) -> tuple[jax.Array, NavigationState]:
+    """Observation and state of the task after the vehicle has moved."""
+    return env.step_env(key, state, action, params)[:2]

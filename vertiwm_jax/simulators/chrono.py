@@ -1,0 +1,240 @@
+"""Project Chrono as a source of drives: its HMMWV, headless, on rigid, soft and mixed ground.
+
+Written for PyChrono 9.0, and like the program that recorded `data/open` with 9.0.1: rigid tyres,
+locked differentials, SCM soil near the wheels alone, 5 ms steps.
+"""
+
+import importlib
+import math
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from vertiwm_jax import geometry
+from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.simulators.chrono_ground import Ground
+from vertiwm_jax.simulators.protocol import (
+    SETTLE_SECONDS,
+    Observation,
+    SimulatorError,
+    under_wheels,
+)
+from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain.map import TerrainMap
+
+STEP = 5e-3
+"""s"""
+SUBSTEPS = round(STEP_SECONDS / STEP)
+SPEED_GAINS = (1.0, 0.0, 0.0)
+"""Of the controller that presses the pedals, on the speed error in m/s."""
+STEERING_RATE = 10.0
+"""1/s, limit on the steering input, which is 1 at full lock."""
+DROP = 0.1
+"""m above the ground at which wheels start."""
+SOIL_WINDOW = (1.0, 0.6, 1.0)
+"""m, box about each wheel in which SCM looks for contact."""
+SOIL_NEAR = 0.8
+"""m from a wheel within which soil counts, on mixed ground."""
+
+_HMMWV = hmmwv()
+
+
+def modules() -> tuple[Any, Any]:
+    """`pychrono` and `pychrono.vehicle`; `SimulatorError` says where to get them."""
+    try:
+        return importlib.import_module("pychrono"), importlib.import_module("pychrono.vehicle")
+    except ImportError as error:
+        raise SimulatorError(
+            "chrono: expected PyChrono 9.0 with its vehicle module, which comes from conda (conda "
+            "install -c projectchrono -c conda-forge pychrono=9.0) or a source build, while the "
+            f"package pychrono on PyPI is something else; found: {error}"
+        ) from None
+
+
+class Chrono:
+    """An HMMWV on the selected world of a map, whose obstacles are solid boxes.
+
+    Commands of backward driving make it brake.
+    """
+
+    def __init__(self, terrain: TerrainMap) -> None:
+        self._modules, self._terrain, self._ground = modules(), terrain, Ground(terrain)
+        self._drive: _Drive | None = None
+
+    def start(self, x: float, y: float, yaw: float) -> Observation:
+        """As `Simulator.start`."""
+        self._drive = None  # before the next: each holds a whole world
+        place = np.array([x, y]) - self._ground.middle
+        self._drive = _Drive(*self._modules, self._ground, place, yaw)
+        for _ in range(round(SETTLE_SECONDS / STEP_SECONDS)):
+            self._drive.advance(0.0, 0.0, brake=True)
+        return self._observe(self._drive)
+
+    def step(self, command: np.ndarray) -> Observation:
+        """As `Simulator.step`."""
+        assert self._drive, "expected start before step"
+        speed, steering = map(float, command)
+        lock = float(_HMMWV.steering_limit)
+        self._drive.advance(speed, min(max(steering / lock, -1.0), 1.0))
+        return self._observe(self._drive)
+
+    def _observe(self, drive: "_Drive") -> Observation:
+        pose, twist, wheels, auxiliary = drive.read()
+        pose[:2] += self._ground.middle
+        wheels[:, :2] += self._ground.middle
+        state, kind, depth = jax.device_get(_observed(self._terrain, pose, twist, wheels))
+        return Observation(state, kind, replace(auxiliary, wheel_sinkage=depth))
+
+
+@jax.jit
+def _observed(
+    terrain: TerrainMap, pose: jax.Array, twist: jax.Array, wheels: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """State `[12]`, classes and sinkages `[4]`, from position and quaternion `[7]`, velocity in
+    the world and angular velocity in the body `[6]`, and wheel centres `[4, 3]`."""
+    rotation = jaxlie.SO3(pose[3:])
+    velocity = rotation.inverse() @ twist[:3]
+    rpy = geometry.rpy_from_rotation(rotation)
+    state = jnp.concatenate([pose[:3], rpy, velocity, twist[3:]])
+    return state, *under_wheels(terrain, wheels, jnp.float32(_HMMWV.wheel_radius))
+
+
+class _Drive:
+    """One vehicle in one Chrono system; points are about the middle of the map."""
+
+    def __init__(
+        self, chrono: Any, vehicle: Any, ground: Ground, place: np.ndarray, yaw: float
+    ) -> None:
+        self._chrono, self._veh, self._ground = chrono, vehicle, ground
+        system = chrono.ChSystemNSC()
+        system.SetGravitationalAcceleration(chrono.ChVector3d(0, 0, -9.81))
+        system.SetCollisionSystemType(chrono.ChCollisionSystem.Type_BULLET)
+        system.SetNumThreads(1, 1, 1)
+        self._system = system
+        self._rigid: Any = None
+        self._scm: Any = None
+        self._soil_map: Any = None
+        if not ground.soft.all():
+            self._rigid = ground.add_rigid(chrono, vehicle, system)
+        if ground.soft.any():
+            self._scm, self._soil_map = ground.add_soil(vehicle, system)
+        ground.add_boxes(chrono, system)
+        self._add_vehicle(place, yaw)
+        self._probes: list[Any] = []
+        if self._scm:
+            self._add_soil_windows()
+        # Rigid tyres touch the ground through the collision system; the terrain passed to
+        # Synchronize only feeds slip read-outs nobody uses, so it is something cheap.
+        self._flat = vehicle.FlatTerrain(-100.0)
+        self._inputs = vehicle.DriverInputs()
+        self._inputs.m_steering = self._inputs.m_throttle = 0.0
+        self._inputs.m_braking = self._inputs.m_clutch = 0.0
+        self._cruise = vehicle.ChSpeedController()
+        self._cruise.Reset(self._car.GetRefFrame())
+        self._cruise.SetGains(*SPEED_GAINS)
+        self._forces = np.zeros((5, 3))
+
+    def _add_vehicle(self, place: np.ndarray, yaw: float) -> None:
+        chrono, veh = self._chrono, self._veh
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        wheels = np.asarray(_HMMWV.wheel_position) @ np.array([[cos, sin], [-sin, cos]]) + place
+        highest = float(self._ground.elevation(wheels).max())
+        start = chrono.ChVector3d(*place.tolist(), highest + float(_HMMWV.wheel_radius) + DROP)
+
+        car = veh.HMMWV_Reduced(self._system)
+        car.SetContactMethod(chrono.ChContactMethod_NSC)
+        car.SetChassisCollisionType(veh.CollisionType_PRIMITIVES)
+        car.SetChassisFixed(False)
+        car.SetEngineType(veh.EngineModelType_SIMPLE_MAP)
+        car.SetTransmissionType(veh.TransmissionModelType_AUTOMATIC_SIMPLE_MAP)
+        car.SetDriveType(veh.DrivelineTypeWV_AWD)
+        car.SetTireType(veh.TireModelType_RIGID)
+        car.SetTireStepSize(STEP)
+        car.SetInitFwdVel(0.0)
+        car.SetInitPosition(chrono.ChCoordsysd(start, chrono.QuatFromAngleZ(float(yaw))))
+        car.Initialize()
+        car.LockAxleDifferential(0, True)
+        car.LockAxleDifferential(1, True)
+        car.LockCentralDifferential(0, True)
+        car.GetVehicle().EnableRealtime(False)
+        self._car, self._vehicle, self._chassis = car, car.GetVehicle(), car.GetChassisBody()
+        self._corners = [(0, veh.LEFT), (0, veh.RIGHT), (1, veh.LEFT), (1, veh.RIGHT)]
+        self._spindles = [self._vehicle.GetWheel(*corner).GetSpindle() for corner in self._corners]
+
+    def _add_soil_windows(self) -> None:
+        """Limits SCM to a box around each wheel. On mixed ground the boxes hang on free-floating
+        probes instead of the wheels, so that a wheel far from soil can be left out of SCM."""
+        size = self._chrono.ChVector3d(*SOIL_WINDOW)
+        if not self._ground.soft.all():
+            self._probes = [self._chrono.ChBody() for _ in self._spindles]
+        for body in self._probes or self._spindles:
+            self._scm.AddMovingPatch(body, self._chrono.VNULL, size)
+
+    def _move_probes(self) -> None:
+        corners = SOIL_NEAR * np.array([(-1, -1), (1, -1), (-1, 1), (1, 1)])
+        for probe, spindle in zip(self._probes, self._spindles, strict=False):
+            pos = spindle.GetPos()
+            if self._ground.is_soft(corners + (pos.x, pos.y)).any():
+                probe.SetPos(pos)
+                probe.SetRot(spindle.GetRot())
+            else:
+                probe.SetPos(self._chrono.ChVector3d(pos.x, pos.y, -1000.0))
+
+    def advance(self, speed: float, steering: float, brake: bool = False) -> None:
+        """Holds m/s and a share of full lock for 0.1 s."""
+        inputs, total = self._inputs, np.zeros((5, 3))
+        for _ in range(SUBSTEPS):
+            now = self._system.GetChTime()
+            pedal = self._cruise.Advance(self._car.GetRefFrame(), speed, now, STEP)
+            pedal = -1.0 if brake else max(-1.0, min(1.0, pedal))
+            inputs.m_throttle, inputs.m_braking = max(pedal, 0.0), max(-pedal, 0.0)
+            turn = STEERING_RATE * STEP
+            inputs.m_steering += max(-turn, min(turn, steering - inputs.m_steering))
+            self._move_probes()
+            self._car.Synchronize(now, inputs, self._flat)
+            self._car.Advance(STEP)
+            self._system.DoStepDynamics(STEP)
+            total += self._contact_forces()
+        self._forces = total / SUBSTEPS
+
+    def _contact_forces(self) -> np.ndarray:
+        """`[5, 3]` N on the wheels and the chassis over the last simulation step, world frame."""
+        forces = np.empty((5, 3))
+        for k, body in enumerate([*self._spindles, self._chassis]):
+            forces[k] = _numbers(body.GetContactForce())
+            if self._scm:
+                force, moment = self._chrono.ChVector3d(), self._chrono.ChVector3d()
+                if self._scm.GetContactForceBody(body, force, moment):
+                    forces[k] += _numbers(force)
+        return forces
+
+    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Auxiliary]:
+        """What `_observed` takes, and what is known of the wheels but their sinkage."""
+        frame, spindles = self._car.GetRefFrame(), self._spindles
+        q = frame.GetRot()
+        pose = np.array([*_numbers(frame.GetPos()), q.e0, q.e1, q.e2, q.e3], np.float32)
+        twist = np.array([*_numbers(frame.GetPosDt()), *_numbers(frame.GetAngVelLocal())])
+        steering = [self._vehicle.GetSteeringAngle(*corner) for corner in self._corners[:2]]
+        auxiliary = Auxiliary(
+            wheel_omega=np.array([s.GetAngVelLocal().y for s in spindles], np.float32),
+            wheel_force=self._forces[:4].astype(np.float32),
+            chassis_force=self._forces[4].astype(np.float32),
+            steer_angle=np.array(steering, np.float32),
+        )
+        wheels = np.array([_numbers(s.GetPos()) for s in spindles], np.float32)
+        return pose, twist.astype(np.float32), wheels, auxiliary
+
+    def __del__(self) -> None:
+        # What refers to the Chrono system must go before the system itself.
+        system = vars(self).pop("_system", None)
+        vars(self).clear()
+        del system
+
+
+def _numbers(vector: Any) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z

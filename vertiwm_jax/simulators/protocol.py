@@ -1,0 +1,63 @@
+"""What every simulator outside jit can do, and what it shows of its vehicle."""
+
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from vertiwm_jax.learning.dataset import Array, Auxiliary
+from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.map import TerrainMap
+
+SETTLE_SECONDS = 1.5
+"""How long a vehicle stands still before a start is handed out, s."""
+_TYRE = 0.2
+"""Half of the length, m, over which the ground under a tyre is taken for a plane."""
+
+
+class SimulatorError(RuntimeError):
+    """A simulator that cannot be run; the message says what it takes."""
+
+
+@struct.dataclass
+class Observation:
+    """One vehicle at one moment, in NumPy arrays.
+
+    state: `[12]` as `VehicleState.vector`, of the body origin between the wheel centres.
+    wheel_class: `[4]` uint8, ground class under each wheel.
+    auxiliary: what the simulator knows of the wheels; forces are means over the last step.
+    """
+
+    state: Array
+    wheel_class: Array
+    auxiliary: Auxiliary
+
+
+class Simulator(Protocol):
+    """Drives one vehicle on one world, 0.1 s at a time."""
+
+    def start(self, x: float, y: float, yaw: float) -> Observation:
+        """A vehicle at rest on its wheels at x, y, m, that looks along yaw, rad."""
+        ...
+
+    def step(self, command: np.ndarray) -> Observation:
+        """The vehicle 0.1 s later. command: `[2]` speed, m/s, and front-wheel angle, rad."""
+        ...
+
+
+def under_wheels(
+    terrain: TerrainMap, centre: jax.Array, radius: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Ground class `[4]` uint8 under wheels, and how deep they reach below the map `[4]`, m.
+
+    centre: `[4, 3]` of the wheels, world frame, m; radius: `[]` m. The depth is along the normal
+    of the undeformed ground, as in the recorded drives; negative in the air.
+    """
+    around = _TYRE * jnp.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], jnp.float32)
+    ground = query.surface(terrain, centre[:, None, :2] + around)
+    middle, east, west, north, south = jnp.moveaxis(ground.height, -1, 0)
+    slope_x, slope_y = (east - west) / (2 * _TYRE), (north - south) / (2 * _TYRE)
+    depth = radius - (centre[:, 2] - middle) / jnp.sqrt(1 + slope_x**2 + slope_y**2)
+    return ground.semantic[:, 0].astype(jnp.uint8), depth
