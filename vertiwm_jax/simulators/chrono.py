@@ -51,7 +51,7 @@ def modules() -> tuple[Any, Any]:
     except ImportError as error:
         raise SimulatorError(
             "chrono: expected PyChrono 9.0 with its vehicle module, which comes from conda (conda "
-            "install -c projectchrono -c conda-forge pychrono=9.0) or a source build, while the "
+            "install -c projectchrono -c conda-forge pychrono) or a source build, while the "
             f"package pychrono on PyPI is something else; found: {error}"
         ) from None
 
