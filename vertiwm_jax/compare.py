@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import jax
 import tyro
 
 from vertiwm_jax import config as configuration
@@ -64,6 +65,8 @@ class CompareConfig:
     """Folder in which the folder of this run is made."""
     resume: Path | None = None
     """Folder of an earlier run to go on with; policies that are trained are not trained again."""
+    compile_cache: Path | None = None
+    """Folder that keeps compiled programs for later runs."""
 
     def __post_init__(self):
         if not (self.rows and self.simulators):
@@ -81,6 +84,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
     program = "python -m vertiwm_jax.compare"
     config = configuration.parse_resumable(CompareConfig, "table3", argv, program)
+    if config.compile_cache:
+        jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
     with failures_in_one_line(ConfigError):
         settings = {row: training(config, row) for row in config.rows}
         with _open(config) as run:
