@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import jax
 import tyro
 
 from vertiwm_jax import config as configuration
@@ -23,7 +22,7 @@ from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.ground import SUITES, GroundConfig, Suite
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.training import failures_in_one_line
+from vertiwm_jax.training import failures_in_one_line, keep_compiled
 from vertiwm_jax.world_model.choice import ModelName
 
 Policies = Callable[[TerrainMap], Mapping[str, Policy | Driver]]
@@ -84,11 +83,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
     program = "python -m vertiwm_jax.compare"
     config = configuration.parse_resumable(CompareConfig, "table3", argv, program)
-    if config.compile_cache:
-        jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
+    keep_compiled(config.compile_cache)
     with failures_in_one_line(ConfigError):
         settings = {row: training(config, row) for row in config.rows}
-        with _open(config) as run:
+        with Run.begin(config, config.name) as run:
             print(f"run folder {run.folder}", flush=True)
             folders = {row: _train(row, settings[row], run.folder) for row in config.rows}
             _judge_all(config, settings, folders, run.folder)
@@ -99,13 +97,6 @@ def training(config: CompareConfig, row: Row) -> TrainConfig:
     folder, kind = config.settings, ALGORITHMS[row.algorithm]
     file = folder / f"{kind.name}.yaml" if folder else configuration.default_config(kind.name)
     return replace(configuration.load(kind, file), model=row.model, planning=None)
-
-
-def _open(config: CompareConfig) -> Run:
-    settings = replace(config, resume=None)
-    if config.resume is None:
-        return Run.create(config.runs, config.name, settings)
-    return Run.open(config.resume, 0, settings)
 
 
 def _train(row: Row, settings: TrainConfig, folder: Path) -> Path:

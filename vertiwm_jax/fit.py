@@ -1,7 +1,7 @@
 """`python -m vertiwm_jax.fit`: fit Verti-WM to recorded drives, all stages of it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -12,7 +12,7 @@ from vertiwm_jax.evaluation import plots
 from vertiwm_jax.learning import pipeline
 from vertiwm_jax.learning.pipeline import PipelineConfig
 from vertiwm_jax.runs import Run
-from vertiwm_jax.training import failures_in_one_line
+from vertiwm_jax.training import failures_in_one_line, keep_compiled
 from vertiwm_jax.world_model import model
 from vertiwm_jax.world_model.model import VertiWMParams
 
@@ -52,11 +52,10 @@ class FitConfig(PipelineConfig):
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
     config = _configuration(argv)
-    if config.compile_cache:
-        jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
+    keep_compiled(config.compile_cache)
     with failures_in_one_line(ValueError):
-        settings, start = replace(config, resume=None), _start(config)
-        with _open(config.resume, settings) as run:
+        start = _start(config)
+        with Run.begin(config, config.name) as run:
             print(f"run folder {run.folder}", flush=True)
             key = jax.random.key(config.seed)
             params = pipeline.fit(config, config.data, key, run, config.reuse, start)
@@ -79,12 +78,6 @@ def _start(config: FitConfig) -> VertiWMParams | None:
     if found != config.model:
         raise ValueError(f"{config.start}: expected {config.model}, found {found}")
     return params
-
-
-def _open(resume: Path | None, settings: FitConfig) -> Run:
-    if resume:
-        return Run.open(resume, 0, settings)
-    return Run.create(settings.runs, settings.name, settings)
 
 
 def _draw(run: Run) -> None:

@@ -3,7 +3,7 @@
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -25,7 +25,7 @@ from vertiwm_jax.rl.settings import LearningConfig
 from vertiwm_jax.rl.task import TaskConfig
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.training import Algorithm, failures_in_one_line
+from vertiwm_jax.training import Algorithm, failures_in_one_line, keep_compiled
 
 Rows = dict[str, Policy | Driver]
 
@@ -142,8 +142,7 @@ def _policies(
 
 def train_and_report(config: TrainConfig) -> Path:
     """Trains, or goes on with, a policy, tests it, and gives the folder of the run."""
-    if config.compile_cache:
-        jax.config.update("jax_compilation_cache_dir", str(config.compile_cache.absolute()))
+    keep_compiled(config.compile_cache)
     try:
         training, test = task.environments(config)
     except ValueError as error:  # what is wrong with the maps, or with the tasks on them
@@ -152,7 +151,7 @@ def train_and_report(config: TrainConfig) -> Path:
     algorithm, schedule, seeds = config.algorithm(env), config.schedule, config.loop.seeds
     steps = schedule.collected * config.action_repeat
     restored = restore(algorithm, params, config.resume, seeds) if config.resume else None
-    with _open(config, restored[0] if restored else 0) as run:
+    with Run.begin(config, config.name, restored[0] if restored else 0) as run:
         print(f"run folder {run.folder}", flush=True)
         print(f"training in {config.model} on {params.terrain.worlds} worlds", flush=True)
         key = config.key("training")
@@ -166,13 +165,6 @@ def train_and_report(config: TrainConfig) -> Path:
         ground_driven, radius = test.params.terrain, config.navigation.goal_radius
         report.write(run.folder, groups, REFERENCE, ground_driven, radius)
     return run.folder
-
-
-def _open(config: TrainConfig, done: int) -> Run:
-    settings = replace(config, resume=None)
-    if config.resume is None:
-        return Run.create(config.runs, config.name, settings)
-    return Run.open(config.resume, done, settings)
 
 
 def _draw_learning(run: Run, config: TrainConfig) -> None:

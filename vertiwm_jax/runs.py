@@ -1,16 +1,19 @@
 """Run folders: configuration, metrics and progress of one command, safe against interruption."""
 
 import contextlib
+import csv
+import dataclasses
+import io
 import json
 import math
 import os
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import rich.progress
 from rich.console import Console
@@ -28,6 +31,21 @@ METRICS = "metrics.jsonl"
 
 class RunError(RuntimeError):
     """A run folder that cannot be read or written; the message names the path."""
+
+
+class Resumable(Protocol):
+    """Settings of a command whose runs can be gone on with, a dataclass.
+
+    runs: folder of runs; resume: that of an earlier one.
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def runs(self) -> Path: ...
+
+    @property
+    def resume(self) -> Path | None: ...
 
 
 class Run:
@@ -73,6 +91,14 @@ class Run:
         except OSError as error:
             raise RunError(f"{folder}: cannot continue the run: {error}") from error
         return cls(folder, events)
+
+    @classmethod
+    def begin(cls, settings: Resumable, name: str, step: int = 0) -> Self:
+        """Create a run with these settings, or continue the one that they name from `step`."""
+        kept = dataclasses.replace(settings, resume=None)
+        if settings.resume is None:
+            return cls.create(settings.runs, name, kept)
+        return cls.open(settings.resume, step, kept)
 
     def part(self, name: str, step: int, settings: Any) -> Self:
         """A run in the folder `name` inside this one: made, or continued like `open` does."""
@@ -222,6 +248,15 @@ def read_columns(folder: str | Path) -> dict[str, list[float]]:
     lines = read_metrics(folder)
     names = dict.fromkeys(name for line in lines for name in line)
     return {name: [line.get(name, math.nan) for line in lines] for name in names}
+
+
+def csv_text(lines: Sequence[Mapping[str, Any]]) -> str:
+    """Lines of equal keys as CSV, with a head."""
+    table = io.StringIO()
+    writer = csv.DictWriter(table, list(lines[0]))
+    writer.writeheader()
+    writer.writerows(lines)
+    return table.getvalue()
 
 
 def write_atomic(path: str | Path, data: bytes | str) -> None:

@@ -79,6 +79,12 @@ def failures_in_one_line(*expected: type[Exception]) -> Iterator[None]:
         sys.exit(f"error: {error}")
 
 
+def keep_compiled(folder: Path | None) -> None:
+    """Keeps compiled programs in a folder for later processes, if there is one."""
+    if folder:
+        jax.config.update("jax_compilation_cache_dir", str(folder.absolute()))
+
+
 def restore(algorithm: Algorithm[State], data: Any, folder: Path) -> tuple[int, State] | None:
     """Iterations done and state in the newest checkpoint of the run in `folder`, if it has one.
 

@@ -47,7 +47,10 @@ class Recorder:
 def images(monkeypatch):
     """Heights that were written for Chrono, by path."""
     written = {}
-    save = lambda image, path: written.update({path: np.asarray(image, float) / 65535})  # noqa: E731
+
+    def save(image, path):
+        written[path] = np.asarray(image, float) / 65535
+
     monkeypatch.setattr(Image.Image, "save", save)
     return written
 

@@ -1,7 +1,5 @@
 """What a test of predictions leaves behind: tables, pictures, and where the error is."""
 
-import csv
-import io
 import operator
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -46,7 +44,7 @@ def write(
         tables.append(f"Wheels of {name} after {horizon} steps, beside those recorded\n")
         tables.append(wheels.format_table(turning))
     runs.write_atomic(folder / "prediction.md", "\n\n".join(tables) + "\n")
-    runs.write_atomic(folder / "prediction.csv", _csv(rows))
+    runs.write_atomic(folder / "prediction.csv", runs.csv_text(prediction.csv_lines(rows)))
 
     growth = {row.name: row.growth for row in rows}
     plots.save(prediction_plots.error_growth(growth, STEP_SECONDS), folder / "prediction.png")
@@ -58,14 +56,6 @@ def write(
             seconds = STEP_SECONDS * np.arange(-AROUND, AROUND + 1)
             figure = prediction_plots.coefficients(traces, COEFFICIENTS, seconds)
             plots.save(figure, folder / "coefficients.png")
-
-
-def _csv(rows: Sequence[PredictionErrors]) -> str:
-    lines, table = prediction.csv_lines(rows), io.StringIO()
-    writer = csv.DictWriter(table, list(lines[0]))
-    writer.writeheader()
-    writer.writerows(lines)
-    return table.getvalue()
 
 
 def _panels(

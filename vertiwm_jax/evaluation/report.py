@@ -1,8 +1,6 @@
 """What a test of policies leaves behind: tables by suite, every episode, and pictures."""
 
-import csv
 import dataclasses
-import io
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -68,7 +66,7 @@ def write(
     runs.write_atomic(folder / "summary.md", markdown(groups, reference) + "\n")
     numbers = json.dumps(summary(groups, reference), indent=2)
     runs.write_atomic(folder / "summary.json", numbers + "\n")
-    runs.write_atomic(folder / "episodes.csv", _csv(groups))
+    runs.write_atomic(folder / "episodes.csv", runs.csv_text(_episodes(groups)))
     for name, results in groups.items():
         hard = _hard_task(results, reference)
         first = next(iter(results.values()))
@@ -102,9 +100,9 @@ def summary(groups: Mapping[str, Results], reference: str) -> dict[str, Any]:
     }
 
 
-def _csv(groups: Mapping[str, Results]) -> str:
+def _episodes(groups: Mapping[str, Results]) -> list[dict[str, str | float]]:
     """One line for each episode."""
-    lines = [
+    return [
         {
             "suite": suite,
             "policy": policy,
@@ -123,11 +121,6 @@ def _csv(groups: Mapping[str, Results]) -> str:
         for result in [jax.device_get(device)]
         for i in range(len(result.ending))
     ]
-    table = io.StringIO()
-    writer = csv.DictWriter(table, list(lines[0]))
-    writer.writeheader()
-    writer.writerows(lines)
-    return table.getvalue()
 
 
 def _hard_task(results: Results, reference: str) -> int:
