@@ -35,10 +35,8 @@ class TerrainEncoder(nn.Module):
             (self.channels, CELL_PIXELS**2, LATENT_CHANNELS),
         )
         bias = self.param("cell_bias", nn.initializers.zeros, (LATENT_CHANNELS,))
-        # A plane at a time: for cells of 3 x 64 pixels, XLA's CPU code divides by 192 and not by
-        # 64 to find every pixel, which takes longer than the arithmetic.
-        planes = (patch[..., i : i + 1] for i in range(self.channels))
-        cells = (_space_to_depth(plane, CELL_PIXELS) for plane in planes)
+        # A plane at a time, so that pixels that were computed cell by cell stay where they are.
+        cells = (_cells(patch[..., i]) for i in range(self.channels))
         latent = bias + sum(cell @ k for cell, k in zip(cells, kernel, strict=True))
 
         coarse = nn.silu(nn.Conv(24, (2, 2), strides=2, padding="VALID")(latent))
@@ -121,15 +119,15 @@ def _cosine_modes(count: int) -> tuple[np.ndarray, np.ndarray]:
     return modes, (1.0 + i + j)[smoothest] / CELL_PIXELS
 
 
-def _space_to_depth(x: jax.Array, block: int) -> jax.Array:
-    """`[..., h, w, c]` to `[..., h / block, w / block, block * block * c]`."""
-    *batch, h, w, c = x.shape
-    x = x.reshape(*batch, h // block, block, w // block, block, c)
-    return jnp.swapaxes(x, -4, -3).reshape(*batch, h // block, w // block, -1)
+def _cells(plane: jax.Array) -> jax.Array:
+    """`[..., 128, 128]` to the pixels of each cell, `[..., 16, 16, 64]`."""
+    *batch, h, w = plane.shape
+    cells = plane.reshape(*batch, h // CELL_PIXELS, CELL_PIXELS, w // CELL_PIXELS, CELL_PIXELS)
+    return jnp.swapaxes(cells, -3, -2).reshape(*batch, h // CELL_PIXELS, w // CELL_PIXELS, -1)
 
 
 def _depth_to_space(x: jax.Array, block: int) -> jax.Array:
-    """The inverse of `_space_to_depth`."""
+    """`[..., h, w, block * block * c]` to `[..., h * block, w * block, c]`, a block from each."""
     *batch, h, w, c = x.shape
     x = x.reshape(*batch, h, w, block, block, c // block**2)
     return jnp.swapaxes(x, -4, -3).reshape(*batch, h * block, w * block, -1)

@@ -10,6 +10,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from vertiwm_jax.state import STEP_SECONDS, Patches
@@ -19,6 +20,24 @@ PATCH_PIXELS = 128
 PATCH_METRES = 12.8
 RELIEF_METRES = 4.0
 """Height above or below the vehicle that is 1 in patches relative to it."""
+
+
+_TILE_PIXELS = 8
+
+
+def _tiled_pixels() -> np.ndarray:
+    """`[3, P]` m ahead, m to the left, and 1, of the pixels of a patch, tile by tile.
+
+    In squares of 8 x 8, as encoders read them: what rearranges them to an image and back cancels
+    when both are compiled together.
+    """
+    offset = ((PATCH_PIXELS - 1) / 2 - np.arange(PATCH_PIXELS)) * PATCH_METRES / PATCH_PIXELS
+    tiles = offset.reshape(-1, _TILE_PIXELS)
+    ahead, left = np.broadcast_arrays(tiles[:, None, :, None], tiles[None, :, None, :])
+    return np.stack([ahead.ravel(), left.ravel(), np.ones(offset.size**2)]).astype(np.float32)
+
+
+_PIXELS = _tiled_pixels()
 
 
 @dataclass(frozen=True)
@@ -64,14 +83,7 @@ def patches(
     selecting each vehicle's world inside.
     """
     position, yaw = jax.lax.stop_gradient((position, yaw))
-    pixel = PATCH_METRES / PATCH_PIXELS
-    offset = ((PATCH_PIXELS - 1) / 2 - jnp.arange(PATCH_PIXELS)) * pixel
-    ahead, left = offset[:, None], offset[None, :]
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    x = position[0] + cos * ahead - sin * left
-    y = position[1] + sin * ahead + cos * left
-    column, row = _grid_coordinates(terrain, x, y)
-
+    column, row = _pixel_coordinates(terrain, position, yaw)
     if config.interpolation == "nearest":
         heights = _nearest(terrain, row, column)
     else:
@@ -83,8 +95,8 @@ def patches(
         elevation = (heights - position[2]) / RELIEF_METRES
     palette = jnp.clip(terrain.class_rgb.astype(jnp.float32) / 127.5 - 1, -1, 1)
     semantic = _gather(terrain.semantic, _cell_index(terrain, row, column)).astype(jnp.int32)
-    rgb = palette.at[semantic].get(mode="promise_in_bounds")
-    return Patches(jnp.clip(elevation, -1, 1), rgb)
+    rgb = [_image(_gather(colours, semantic)) for colours in palette.T]
+    return Patches(_image(jnp.clip(elevation, -1, 1)), jnp.stack(rgb, axis=-1))
 
 
 def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
@@ -97,7 +109,7 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
     column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
     cell = _cell_index(terrain, row, column)
     semantic = _gather(terrain.semantic, cell).astype(jnp.int32)
-    soft = terrain.deformable.at[semantic].get(mode="promise_in_bounds")
+    soft = _gather(terrain.deformable, semantic)
     bottom_left, along, up, twist, fx, fy = _corners(terrain, row, column)
     rising = fx > fy
     height = (
@@ -148,13 +160,40 @@ def _grid_coordinates(
     terrain: TerrainMap, x: jax.Array, y: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Points to fractional (column, row) of the vertices, on the map."""
-    _, rows, columns = terrain.elevation.shape
     column = (x - terrain.origin[0]) / terrain.resolution
     row = (terrain.origin[1] - y) / terrain.resolution
+    return _on_map(terrain, column, row)
+
+
+def _pixel_coordinates(
+    terrain: TerrainMap, position: jax.Array, yaw: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The same of all pixels of the patch at a pose, tile by tile."""
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    x, y = position[0] - terrain.origin[0], terrain.origin[1] - position[1]
+    # One matmul, in full precision: fused with gathers, this would be done twice, and sine and
+    # cosine for every pixel.
+    to_grid = jnp.stack([jnp.stack([cos, -sin, x]), jnp.stack([-sin, -cos, y])])
+    column, row = jnp.dot(to_grid / terrain.resolution, _PIXELS, precision="highest")
+    return _on_map(terrain, column, row)
+
+
+def _on_map(
+    terrain: TerrainMap, column: jax.Array, row: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Fractional (column, row), or those of the nearest edge; NaN becomes 0."""
+    _, rows, columns = terrain.elevation.shape
     # `where` and not `clip`: NaN becomes 0, and its gradient too.
     column = jnp.minimum(jnp.where(column > 0, column, 0.0), columns - 1.0)
     row = jnp.minimum(jnp.where(row > 0, row, 0.0), rows - 1.0)
     return column, row
+
+
+def _image(tiled: jax.Array) -> jax.Array:
+    """Pixels `[P]`, tile by tile, to the image `[128, 128]`."""
+    tiles = PATCH_PIXELS // _TILE_PIXELS
+    tiled = tiled.reshape(tiles, tiles, _TILE_PIXELS, _TILE_PIXELS)
+    return jnp.swapaxes(tiled, 1, 2).reshape(PATCH_PIXELS, PATCH_PIXELS)
 
 
 def _inside(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
@@ -171,8 +210,9 @@ def _flat_index(
     return (terrain.world * rows + row) * columns + column
 
 
-def _gather(raster: jax.Array, index: jax.Array) -> jax.Array:
-    return raster.reshape(-1).at[index].get(mode="promise_in_bounds")
+def _gather(table: jax.Array, index: jax.Array) -> jax.Array:
+    flat = table.reshape(-1)
+    return flat.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _cell_index(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Array:
