@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -74,7 +76,14 @@ def test_a_diverged_state_never_leaves():
     (_, before, *_), (observation, after, reward, *_) = play(drive([1.0, np.nan]), 2)
     assert jnp.isfinite(observation).all() and jnp.isfinite(reward)
     chex.assert_trees_all_equal(after.vehicle, before.vehicle)
-    assert after.history == before.history
+
+
+@pytest.mark.parametrize("last", [22.5, np.nan], ids=["goal", "diverged"])
+def test_an_episode_that_is_over_stays_as_it_is(last):
+    _, end, after = play(drive([10.0, last, 1.0]), 3)
+    assert float(end[2]) != 0 and float(after[2]) == 0
+    kept = [replace(state, history=()) for _, state, *_ in (end, after)]
+    chex.assert_trees_all_equal((end[0], kept[0], *end[3:]), (after[0], kept[1], *after[3:]))
 
 
 def test_standing_is_stuck_only_without_a_break():

@@ -22,7 +22,8 @@ class ProbeParams(environment.EnvParams):
 class Probe(environment.Environment):
     """One observed number, which starts as `start`; one action in [low, high].
 
-    `steps` steps, then the end (`terminates`) or, by the parameters' limit, a truncation.
+    `steps` steps, then the end (`terminates`) or, by the parameters' limit, a truncation; from
+    then on all stays as it is.
     """
 
     steps: int | None = 1
@@ -34,10 +35,11 @@ class Probe(environment.Environment):
         return jnp.ones(())
 
     def step_env(self, key, state, action, params):
-        time = state.time + 1
+        running = ~(self.is_terminated(state, params) | self.is_truncated(state, params))
+        time = state.time + running
         new = ProbeState(time=time, observation=jnp.float32(time))
         over = self.is_terminated(new, params)
-        reward = self.reward(state, action[0])
+        reward = jnp.where(running, self.reward(state, action[0]), 0.0)
         return new.observation[None], new, reward, over, {"time": time}
 
     def reset_env(self, key, params):

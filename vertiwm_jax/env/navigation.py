@@ -149,24 +149,29 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         action: int | float | jax.Array,
         params: NavigationParams,
     ) -> tuple[jax.Array, NavigationState, jax.Array, jax.Array, dict[Any, Any]]:
-        """One step of 0.1 s; a state that diverged is replaced by the last plausible one."""
+        """One step of 0.1 s; a state that diverged is replaced by the last plausible one.
+
+        An episode that is over stays as it is, and gives no reward. Only its history goes on: to
+        keep that, all of it would be copied in every step.
+        """
         config = self.config
         terrain = params.terrain.select(state.world)
         action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
-        moved = self.dynamics.step(
+        moved, history = self.dynamics.step(
             params.dynamics, terrain, state.history, state.vehicle, config.command(action)
         )
-        plausible = self._is_plausible(terrain, moved[0])
-        vehicle, history, action = jax.tree.map(
-            lambda new, old: jnp.where(plausible, new, old),
-            (*moved, action),
-            (state.vehicle, state.history, state.action),
+        running = state.ending == Ending.RUNNING
+        plausible = self._is_plausible(terrain, moved)
+        vehicle, action = jax.tree.map(
+            lambda new, old: jnp.where(running & plausible, new, old),
+            (moved, action),
+            (state.vehicle, state.action),
         )
 
         speed = jnp.linalg.norm(vehicle.velocity[:2])
         is_stalled = speed < config.stalled_speed
-        stalled = jnp.where(is_stalled, state.stalled + 1, 0)
-        time = jnp.int32(state.time) + 1
+        stalled = jnp.where(is_stalled, state.stalled + running, 0)
+        time = jnp.int32(state.time) + running
         before, _ = observation.distance_and_bearing(state.vehicle.position, state.goal)
         distance, _ = observation.distance_and_bearing(vehicle.position, state.goal)
         roll, pitch, yaw = vehicle.rpy
@@ -186,6 +191,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
                 Ending.DIVERGED: ~plausible,
             }
         )
+        ending = jnp.where(running, ending, state.ending)
         climb = vehicle.position[2] - state.vehicle.position[2]
         gain = reward(
             config.reward,
@@ -197,6 +203,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
             vertical_speed=climb / STEP_SECONDS,
             ending=ending,
         )
+        gain = jnp.where(running, gain, 0.0)
         new = dataclasses.replace(
             state,
             vehicle=vehicle,

@@ -26,6 +26,7 @@ def corrected(
 class ActionRepeat(Environment):
     """Holds every action for `times` steps of `env`, or until the episode ends.
 
+    What `env` gives must stay as it is from the end of an episode on, with rewards of 0.
     Rewards add up. Exploration noise that lasts moves a vehicle where noise that changes at every
     step only shakes it, and credit is given to fewer decisions (Mnih et al., 2015).
 
@@ -46,20 +47,16 @@ class ActionRepeat(Environment):
     ) -> tuple[jax.Array, Any, jax.Array, jax.Array, dict[Any, Any]]:
         keys = jax.random.split(key, self.times)
 
-        def once(observation: jax.Array, state: Any, key: jax.Array) -> tuple:
+        def once(carry: tuple[jax.Array, Any], key: jax.Array) -> tuple:
+            observation, state = carry
             acted = corrected(self.base, observation, key, jnp.asarray(action))
-            return self.env.step_env(key, state, acted, params)
+            observation, state, *result = self.env.step_env(key, state, acted, params)
+            return (observation, state), result
 
-        first = once(self.env.observe(key, state, None, params), state, keys[0])
-
-        def again(result: tuple, key: jax.Array) -> tuple[tuple, None]:
-            observation, state, reward, terminated, _ = result
-            over = terminated | self.env.is_truncated(state, params)
-            more = once(observation, state, key)
-            more = (*more[:2], reward + more[2], *more[3:])
-            return jax.tree.map(lambda old, new: jnp.where(over, old, new), result, more), None
-
-        return jax.lax.scan(again, first, keys[1:])[0]
+        first = self.env.observe(key, state, None, params), state
+        (observation, state), (rewards, terminated, info) = jax.lax.scan(once, first, keys)
+        last = jax.tree.map(lambda x: x[-1], (terminated, info))
+        return observation, state, jnp.sum(rewards), *last
 
     def is_truncated(self, state: Any, params: Any) -> jax.Array:
         return self.env.is_truncated(state, params)

@@ -91,14 +91,9 @@ def _evaluate(
         memory: Any, observation: jax.Array, state: NavigationState, key: jax.Array
     ) -> tuple[Any, jax.Array, NavigationState]:
         key_policy, key_step = jax.random.split(key)
-        action, new_memory = driver.act(params, memory, observation, state, key_policy)
-        new_observation, new_state, *_ = env.step_env(key_step, state, action, params)
-        over = state.ending != Ending.RUNNING
-        return jax.tree.map(
-            lambda old, new: jnp.where(over, old, new),
-            (memory, observation, state),
-            (new_memory, new_observation, new_state),
-        )
+        action, memory = driver.act(params, memory, observation, state, key_policy)
+        observation, state, *_ = env.step_env(key_step, state, action, params)
+        return memory, observation, state
 
     def advance(carry: tuple, _: None) -> tuple[tuple, None]:
         step, memory, observation, state, paths = carry

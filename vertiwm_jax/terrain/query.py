@@ -178,9 +178,7 @@ def _pixel_coordinates(
     return _on_map(terrain, column, row)
 
 
-def _on_map(
-    terrain: TerrainMap, column: jax.Array, row: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _on_map(terrain: TerrainMap, column: jax.Array, row: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Fractional (column, row), or those of the nearest edge; NaN becomes 0."""
     _, rows, columns = terrain.elevation.shape
     # `where` and not `clip`: NaN becomes 0, and its gradient too.
