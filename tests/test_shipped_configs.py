@@ -1,0 +1,28 @@
+"""The configurations that come with the package."""
+
+from pathlib import Path
+
+import pytest
+
+from vertiwm_jax import config, evaluate
+from vertiwm_jax.compare import CompareConfig
+from vertiwm_jax.fit import FitConfig
+from vertiwm_jax.ppo import PPOTraining
+
+FOLDER = Path(__file__).parents[1] / "configs"
+KINDS = {"table3": CompareConfig} | dict.fromkeys(
+    ["fit_chrono", "fit_paper", "fine_tune"], FitConfig
+)
+
+
+@pytest.mark.parametrize("file", sorted(FOLDER.rglob("*.yaml")), ids=lambda file: file.stem)
+def test_every_one_can_be_read(file):
+    kind = FitConfig if file.parent.name == "rows" else KINDS.get(file.stem)
+    loaded = config.load(kind, file) if kind else evaluate.training(file)
+    assert kind or loaded.name in file.stem
+
+
+def test_the_papers_schedule_is_the_papers():
+    training = config.load(PPOTraining, config.default_config("ppo_paper"))
+    assert training.ppo.iterations == 2_000 and training.ppo.collected == 20 * 300
+    assert training.action_repeat == 1 and training.base == "none"
