@@ -14,7 +14,6 @@ from gymnax.environments import environment, spaces
 
 from benchmarks._harness import Figures, measure, parser, report
 from vertiwm_jax import config as configuration
-from vertiwm_jax.config import default_config
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
@@ -53,7 +52,8 @@ def iteration(ppo: PPO, params: Any, repeat: int = 1) -> Figures:
 
 def of_task(name: str, model: ModelName) -> Figures:
     """An iteration of the training that the configuration `name` describes, inside a model."""
-    config = replace(configuration.load(PPOTraining, default_config(name)), model=model)
+    file = configuration.default_config(name)
+    config = replace(configuration.load(PPOTraining, file), model=model)
     training, _ = task.environments(config)
     return iteration(config.algorithm(training.env), training.params, config.action_repeat)
 

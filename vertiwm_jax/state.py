@@ -70,6 +70,10 @@ class Command:
         return jnp.stack([self.speed, self.steering], axis=-1)
 
 
+CELL_PIXELS = 8
+"""Side of the squares of pixels in which patches are queried, and of which each is encoded."""
+
+
 @struct.dataclass
 class Patches:
     """Vehicle-aligned observations of the ground (the paper's m_t), in [-1, 1].

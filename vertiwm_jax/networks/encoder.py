@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax.state import CELL_PIXELS
+
 LATENT_CHANNELS = 18
-CELL_PIXELS = 8
-"""Pixels along the side of the square that one latent cell covers."""
 
 
 class TerrainEncoder(nn.Module):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax.state import STEP_SECONDS, Patches
+from vertiwm_jax.state import CELL_PIXELS, STEP_SECONDS, Patches
 from vertiwm_jax.terrain.map import TerrainMap
 
 PATCH_PIXELS = 128
@@ -22,22 +22,19 @@ RELIEF_METRES = 4.0
 """Height above or below the vehicle that is 1 in patches relative to it."""
 
 
-_TILE_PIXELS = 8
+def _pixels() -> np.ndarray:
+    """`[3, P]` m ahead, m to the left, and 1, of the pixels of a patch, cell by cell.
 
-
-def _tiled_pixels() -> np.ndarray:
-    """`[3, P]` m ahead, m to the left, and 1, of the pixels of a patch, tile by tile.
-
-    In squares of 8 x 8, as encoders read them: what rearranges them to an image and back cancels
-    when both are compiled together.
+    As encoders read them: what rearranges them to an image and back cancels when both are
+    compiled together.
     """
     offset = ((PATCH_PIXELS - 1) / 2 - np.arange(PATCH_PIXELS)) * PATCH_METRES / PATCH_PIXELS
-    tiles = offset.reshape(-1, _TILE_PIXELS)
-    ahead, left = np.broadcast_arrays(tiles[:, None, :, None], tiles[None, :, None, :])
+    cells = offset.reshape(-1, CELL_PIXELS)
+    ahead, left = np.broadcast_arrays(cells[:, None, :, None], cells[None, :, None, :])
     return np.stack([ahead.ravel(), left.ravel(), np.ones(offset.size**2)]).astype(np.float32)
 
 
-_PIXELS = _tiled_pixels()
+_PIXELS = _pixels()
 
 
 @dataclass(frozen=True)
@@ -168,13 +165,13 @@ def _grid_coordinates(
 def _pixel_coordinates(
     terrain: TerrainMap, position: jax.Array, yaw: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The same of all pixels of the patch at a pose, tile by tile."""
+    """The same of all pixels of the patch at a pose, cell by cell."""
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     x, y = position[0] - terrain.origin[0], terrain.origin[1] - position[1]
     # One matmul, in full precision: fused with gathers, this would be done twice, and sine and
     # cosine for every pixel.
-    to_grid = jnp.stack([jnp.stack([cos, -sin, x]), jnp.stack([-sin, -cos, y])])
-    column, row = jnp.dot(to_grid / terrain.resolution, _PIXELS, precision="highest")
+    to_grid = jnp.array([[cos, -sin, x], [-sin, -cos, y]]) / terrain.resolution
+    column, row = jnp.dot(to_grid, _PIXELS, precision="highest")
     return _on_map(terrain, column, row)
 
 
@@ -187,11 +184,11 @@ def _on_map(terrain: TerrainMap, column: jax.Array, row: jax.Array) -> tuple[jax
     return column, row
 
 
-def _image(tiled: jax.Array) -> jax.Array:
-    """Pixels `[P]`, tile by tile, to the image `[128, 128]`."""
-    tiles = PATCH_PIXELS // _TILE_PIXELS
-    tiled = tiled.reshape(tiles, tiles, _TILE_PIXELS, _TILE_PIXELS)
-    return jnp.swapaxes(tiled, 1, 2).reshape(PATCH_PIXELS, PATCH_PIXELS)
+def _image(pixels: jax.Array) -> jax.Array:
+    """Pixels `[P]`, cell by cell, to the image `[128, 128]`."""
+    cells = PATCH_PIXELS // CELL_PIXELS
+    pixels = pixels.reshape(cells, cells, CELL_PIXELS, CELL_PIXELS)
+    return jnp.swapaxes(pixels, 1, 2).reshape(PATCH_PIXELS, PATCH_PIXELS)
 
 
 def _inside(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
