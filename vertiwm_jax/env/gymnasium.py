@@ -87,7 +87,7 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """A start drawn from the pool; there are no options."""
         super().reset(seed=seed)
         self._key = jax.random.key(self.np_random.integers(2**31))
-        observation, self._state = _reset(self._env, self._key, self._params)
+        observation, self._state = self._start()
         return np.asarray(observation), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -115,6 +115,9 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             config.goal_radius,
             config.chassis,
         )
+
+    def _start(self) -> tuple[jax.Array, NavigationState]:
+        return _reset(self._env, self._key, self._params)
 
 
 class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):

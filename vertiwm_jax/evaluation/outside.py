@@ -1,7 +1,7 @@
 """How well a policy drives in a simulator outside jit: the same task, one episode at a time."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,27 +15,10 @@ from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation.navigation import NavigationResult
 from vertiwm_jax.runs import Progress
+from vertiwm_jax.simulators import following
+from vertiwm_jax.simulators.following import Followed
 from vertiwm_jax.simulators.protocol import Simulator
-from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
-
-
-@dataclass(frozen=True)
-class Followed:
-    """The dynamics of a vehicle that something else moves; parameters: `[12]` its next state."""
-
-    def init(self, params: jax.Array, terrain: TerrainMap, state: VehicleState) -> tuple[()]:
-        return ()
-
-    def step(
-        self,
-        params: jax.Array,
-        terrain: TerrainMap,
-        history: tuple[()],
-        state: VehicleState,
-        command: Command,
-    ) -> tuple[VehicleState, tuple[()]]:
-        return VehicleState.from_vector(params), ()
 
 
 def evaluate(
@@ -57,13 +40,11 @@ def evaluate(
         for i in range(params.pool_size):
             task = jax.tree.map(lambda x, i=i: x[i], jax.device_get(tasks))
             vehicle = simulator(params.terrain.select(task.world))
-            x, y = task.start.tolist()
-            seen = vehicle.start(x, y, float(task.yaw))
+            pose = (*task.start.tolist(), float(task.yaw))
             start = jax.tree.map(lambda x, i=i: x[i], params.starts)
-            begin = VehicleState.from_vector(jnp.asarray(seen.state))
-            start = replace(start, vehicle=begin, history=())
+            observation, state = following.start(vehicle, env, params, start, pose)
             own = jax.random.fold_in(key, i)
-            episodes.append(_episode(vehicle, env, params, driver, start, own))
+            episodes.append(_episode(vehicle, env, params, driver, observation, state, own))
             progress.advance()
     return jax.tree.map(lambda *x: jnp.stack(x), *episodes)
 
@@ -73,11 +54,11 @@ def _episode(
     env: NavigationEnv,
     params: NavigationParams,
     driver: Driver,
+    observation: jax.Array,
     state: NavigationState,
     key: jax.Array,
 ) -> NavigationResult:
     """One episode, leaves without the axis of tasks."""
-    observation = env.observe(None, state, None, params)
     memory, length = driver.start(params, state), int(params.max_steps_in_episode)
     path = [np.concatenate([state.vehicle.position, state.vehicle.rpy])]
     while state.ending == Ending.RUNNING:
@@ -86,8 +67,7 @@ def _episode(
         if step % driver.interval == 0:
             memory = _decide(driver, params, memory, observation, state, deciding)
         action, memory = _act(driver, params, memory, observation, state, acting)
-        seen = simulator.step(np.asarray(env.config.command(action).vector))
-        moved = replace(params, dynamics=jnp.asarray(seen.state))
+        moved = following.move(simulator, env, params, action)
         observation, state = _follow(env, moved, state, action, acting)
         path.append(np.concatenate([state.vehicle.position, state.vehicle.rpy]))
     poses = np.stack(path)

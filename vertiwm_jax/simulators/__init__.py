@@ -1,1 +1,1 @@
-"""Sources of truth outside jit: one vehicle, one world, one step of 0.1 s at a time; recording."""
+"""Sources of truth outside jit: one vehicle, one world, 0.1 s at a time; recording, and tasks."""

@@ -1,0 +1,62 @@
+"""The navigation task of a vehicle that a simulator outside jit moves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
+from vertiwm_jax.simulators.protocol import Simulator
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain.map import TerrainMap
+
+
+@dataclass(frozen=True)
+class Followed:
+    """The dynamics of a vehicle that something else moves; parameters: `[12]` its next state."""
+
+    def init(self, params: jax.Array, terrain: TerrainMap, state: VehicleState) -> tuple[()]:
+        return ()
+
+    def step(
+        self,
+        params: jax.Array,
+        terrain: TerrainMap,
+        history: tuple[()],
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, tuple[()]]:
+        return VehicleState.from_vector(params), ()
+
+
+def start(
+    simulator: Simulator,
+    env: NavigationEnv,
+    params: NavigationParams,
+    state: NavigationState,
+    pose: Sequence[float],
+) -> tuple[jax.Array, NavigationState]:
+    """Observation and state of an episode whose vehicle stands in `simulator`.
+
+    state: a start of the pool, whose vehicle is replaced; pose: `[3]` x, y, m, and yaw, rad.
+    """
+    return _begin(env, params, state, simulator.start(*pose).state)
+
+
+def move(
+    simulator: Simulator, env: NavigationEnv, params: NavigationParams, action: jax.Array
+) -> NavigationParams:
+    """Does the action `[2]` in `simulator`; `Followed` does the same with these parameters."""
+    seen = simulator.step(np.asarray(env.config.command(action).vector))
+    return replace(params, dynamics=jnp.asarray(seen.state))
+
+
+@partial(jax.jit, static_argnames="env")
+def _begin(
+    env: NavigationEnv, params: NavigationParams, state: NavigationState, seen: jax.Array
+) -> tuple[jax.Array, NavigationState]:
+    state = replace(state, vehicle=VehicleState.from_vector(seen), history=())
+    return env.observe(None, state, None, params), state

@@ -1,0 +1,54 @@
+"""Navigation in a simulator outside jit, for code that expects Gymnasium."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vertiwm_jax.env.gymnasium import NavigationGymEnv
+from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv, NavigationState
+from vertiwm_jax.env.tasks import Tasks
+from vertiwm_jax.simulators import following
+from vertiwm_jax.simulators.following import Followed
+from vertiwm_jax.simulators.protocol import Simulator
+from vertiwm_jax.terrain.map import TerrainMap
+
+
+class SimulatorEnv(NavigationGymEnv):
+    """One vehicle in a simulator; observation, reward and endings are those of `NavigationEnv`.
+
+    simulator: as `Chrono` or `BuiltIn`, called in every reset with the world of the task selected.
+    tasks: the pool that resets draw from; `ValueError` names the first that cannot be driven.
+    config: but `settle_steps`, since simulators let the vehicle settle themselves.
+    """
+
+    def __init__(
+        self,
+        simulator: Callable[[TerrainMap], Simulator],
+        terrain: TerrainMap,
+        tasks: Tasks,
+        config: NavigationConfig = NavigationConfig(),
+        render_mode: str | None = None,
+    ) -> None:
+        # Nothing settles in the pool, so that its starts are still where the tasks put them.
+        env = NavigationEnv(Followed(), replace(config, settle_steps=0))
+        super().__init__(env, env.make_params(jnp.zeros(12), terrain, tasks), render_mode)
+        self._make = simulator
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """As `NavigationGymEnv.step`."""
+        if self._state is not None:
+            self._params = following.move(
+                self._simulator, self._env, self._params, jnp.asarray(action)
+            )
+        return super().step(action)
+
+    def _start(self) -> tuple[jax.Array, NavigationState]:
+        _, state = super()._start()
+        self._simulator = self._make(self._params.terrain.select(state.world))
+        x, y, _ = state.vehicle.position.tolist()
+        pose = (x, y, float(state.vehicle.rpy[2]))
+        return following.start(self._simulator, self._env, self._params, state, pose)
