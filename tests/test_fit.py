@@ -125,8 +125,19 @@ def test_another_gate_for_the_specialists_of_an_earlier_run(run, fitted, capsys)
     assert (other / "learning_curves.png").stat().st_size > 10_000
 
 
-def test_a_fit_goes_on_from_a_model(run, fitted, folder, tmp_path):
-    further = fitted("--start", str(run / "model"))
+def test_specialists_may_share_the_encoders_of_one(run, fitted):
+    shared = fitted("--model.encoders", "shared", "--reuse", str(run))
+    assert not (shared / "nesam_autoencoders").exists()
+    params, before = (model.load(place / "model")[1] for place in (shared, run))
+    chex.assert_trees_all_equal(params.nesam.encoders, before.transformer.encoders)
+    chex.assert_trees_all_equal(params.transformer, before.transformer)
+
+
+def test_a_fit_goes_on_from_a_model_with_more_drives(run, fitted, folder, tmp_path):
+    (tmp_path / "more").mkdir()
+    shutil.copy(folder / "drives" / "rigid" / "world.npz", tmp_path / "more" / "driven.npz")
+    shutil.copytree(folder / "drives" / "maps", tmp_path / "more" / "maps")
+    further = fitted("--start", str(run / "model"), "--add", str(tmp_path / "more"))
     stages = {path.name for path in further.iterdir() if path.is_dir()}
     assert stages == {"nesam_rollouts", "transformer_rollouts", "gate", "model"}
     before, after = (model.load(place / "model")[1] for place in (run, further))
@@ -138,7 +149,7 @@ def test_a_fit_goes_on_from_a_model(run, fitted, folder, tmp_path):
         )
         chex.assert_trees_all_equal(old.replace(network=None), new.replace(network=None))
     inputs = [(place / "nesam_rollouts" / "inputs.txt").read_text() for place in (run, further)]
-    assert inputs[0] != inputs[1]
+    assert ["driven.npz" in text for text in inputs] == [False, True]
     other = ("--config", folder / "tiny.yaml", "--model.coefficients", "scalar")
     message = refusal(fit.main, *other, "--start", run / "model", "--runs", tmp_path / "runs")
     assert "coefficients='scalar'" in message and "coefficients='grouped'" in message
@@ -167,6 +178,7 @@ def test_one_specialist_alone_is_fitted_and_compared(fitted, folder, tmp_path, c
         ({"parts": ()}, "at least one"),
         ({"parts": ("gate", "nesam")}, "both specialists"),
         ({"terrain": "none"}, "patches for the gate"),
+        ({"parts": ("nesam",), "encoders": "shared"}, "two parts"),
     ],
 )
 def test_models_without_sense_are_refused(settings, words):
@@ -174,7 +186,10 @@ def test_models_without_sense_are_refused(settings, words):
         model.ModelConfig(**settings)
 
 
-def test_what_cannot_be_fitted_is_named(run, folder, tmp_path):
+def test_what_cannot_be_fitted_is_named(run, folder, tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        fit.main(["--model.encoders", "shared", "--nesam.learns-from", "rigid"])
+    assert "model.encoders: expected own ones" in capsys.readouterr().err
     message = refusal(fit.main, "--data", tmp_path, "--runs", tmp_path / "runs")
     assert "expected files of drives, or folders of them named rigid" in message
     again = shutil.copytree(run, tmp_path / "again")

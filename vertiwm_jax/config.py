@@ -120,13 +120,16 @@ def parse(
             ("fields", Annotated[cls, tyro.conf.arg(name="")], config),
         ],
     )
-    return tyro.cli(
-        command_line,
-        args=argv,
-        prog=prog,
-        description=inspect.getdoc(cls),
-        config=(tyro.conf.AvoidSubcommands, tyro.conf.FlagConversionOff),
-    ).fields
+    try:
+        return tyro.cli(
+            command_line,
+            args=argv,
+            prog=prog,
+            description=inspect.getdoc(cls),
+            config=(tyro.conf.AvoidSubcommands, tyro.conf.FlagConversionOff),
+        ).fields
+    except ValueError as error:  # tyro lets through what the outermost dataclass refuses
+        first.exit(2, f"{first.prog}: error: {error}\n")
 
 
 def parse_resumable(cls: type[T], name: str, argv: Sequence[str] | None, program: str) -> T:

@@ -8,6 +8,7 @@ trajectories by `lax.scan`; weights, maps and state are arguments.
 from typing import Any, Protocol
 
 import jax
+import jax.numpy as jnp
 
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
@@ -35,6 +36,14 @@ class Dynamics(Protocol):
         state: VehicleState,
         command: Command,
     ) -> tuple[VehicleState, History]: ...
+
+
+def disagreement(history: History) -> jax.Array:
+    """`[]` m between where the models went that the last step was made of; 0 of a single one.
+
+    A sign of what none of them has learned (Kidambi et al., 2020, "MOReL").
+    """
+    return getattr(history, "disagreement", jnp.float32(0))
 
 
 def warm_up(

@@ -32,6 +32,8 @@ class FitConfig(PipelineConfig):
 
     data: tuple[Path, ...] = (Path("data/open"),)
     """Folders of drives, or of such folders named rigid, deformable and mixed."""
+    add: tuple[Path, ...] = ()
+    """Folders of more drives beside those, such as a policy has driven (`collect --policy`)."""
     name: str = "fit"
     """What the name of the run folder begins with; the date follows."""
     seed: int = 0
@@ -58,7 +60,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         with Run.begin(config, config.name) as run:
             print(f"run folder {run.folder}", flush=True)
             key = jax.random.key(config.seed)
-            params = pipeline.fit(config, config.data, key, run, config.reuse, start)
+            folders = config.data + config.add
+            params = pipeline.fit(config, folders, key, run, config.reuse, start)
             model.save(run.folder / "model", config.model, params)
             _draw(run)
     print(f"the model is in {run.folder / 'model'}; how well it predicts:")

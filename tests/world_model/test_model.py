@@ -2,6 +2,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +19,7 @@ from world_model.examples import (
     rough,
 )
 
-from vertiwm_jax.dynamics import rollout
+from vertiwm_jax.dynamics import disagreement, rollout
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.terrain import query
@@ -161,6 +162,21 @@ def test_both_see_the_fused_state_through_their_own_encoders():
     assert history.perception is history.transformer.perception
 
 
+def test_shared_encoders_are_those_of_the_transformer():
+    """With the same weights for both it is the same model, and NeSAM's own are not asked."""
+    other = jax.tree.map(lambda x: 1.2 * x, PARAMS.nesam.encoders)  # untrained, all are alike
+    apart, alike = (
+        replace(PARAMS, nesam=replace(PARAMS.nesam, encoders=encoders))
+        for encoders in (other, PARAMS.transformer.encoders)
+    )
+    expected, expected_alphas = fused(alike, TERRAIN, STATE, CONTROL)
+    shared = replace(MODEL, encoders="shared")
+    states, alphas = fused(apart, TERRAIN, STATE, CONTROL, model=shared)
+    np.testing.assert_allclose(alphas, expected_alphas, atol=1e-5)
+    chex.assert_trees_all_close(states, expected, atol=1e-4)
+    assert np.max(np.abs(alphas - fused(apart, TERRAIN, STATE, CONTROL)[1])) > 1e-3
+
+
 def test_shared_patches_are_queried_once(monkeypatch):
     calls = []
     plain = query.patches
@@ -179,6 +195,20 @@ def test_coefficients_are_in_the_history_and_vary_along_a_drive():
     start = init(PARAMS, TERRAIN, STATE)
     np.testing.assert_array_equal(start.coefficients, 0.5)
     np.testing.assert_array_equal(start.hidden, 0)
+
+
+def test_disagreement_is_how_far_apart_the_proposals_are():
+    history = init(PARAMS, TERRAIN, STATE)
+    assert disagreement(history) == 0
+    ends, first = [], jax.tree.map(lambda x: x[:1], CONTROL)
+    for name in ("transformer", "nesam"):
+        specialist, params = getattr(MODEL, name), getattr(PARAMS, name)
+        ends.append(alone(params, TERRAIN, STATE, first, specialist))
+    _, history = step(PARAMS, TERRAIN, history, STATE, COMMAND)
+    apart = np.linalg.norm(ends[0].position[0] - ends[1].position[0])
+    assert apart > 1e-3
+    # Of increments, which for turning bodies are not quite straight lines.
+    np.testing.assert_allclose(disagreement(history), apart, rtol=2e-2)
 
 
 def test_a_scalar_gate_has_one_coefficient():

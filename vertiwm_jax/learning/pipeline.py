@@ -86,6 +86,14 @@ class PipelineConfig:
     gate: GateConfig = GateConfig()
     """What fuses the two."""
 
+    def __post_init__(self):
+        kinds = self.transformer.learns_from, self.nesam.learns_from
+        if self.model.encoders == "shared" and kinds[0] != kinds[1]:
+            raise ValueError(
+                f"model.encoders: expected own ones for specialists that learn from different "
+                f"collections, {kinds[0]} and {kinds[1]}, found shared"
+            )
+
 
 def fit(
     config: PipelineConfig,
@@ -147,10 +155,11 @@ class _Pipeline:
         if self.start is None and params.encoders is not None:
             patches = replace(self.config.patches, patches=specialist.exteroception.patches)
             places = cache(lambda: PatchData.of(patches, *drives()))
-            problem = AutoencoderProblem(patches)
-            pair = problem.init_params(self._key(name))
-            stage = f"{name}_autoencoders", problem, config.autoencoders, kinds
-            pair, digest = self._fit(*stage, pair, places)
+            problem, seeing, schedule = AutoencoderProblem(patches), name, config.autoencoders
+            if self.config.model.encoders == "shared":
+                seeing, schedule = "transformer", self.config.transformer.autoencoders
+            stage = f"{seeing}_autoencoders", problem, schedule, kinds
+            pair, digest = self._fit(*stage, problem.init_params(self._key(seeing)), places)
             before = (digest,)
             params = replace(params, encoders=autoencoders.encoders(pair))
             if isinstance(specialist, Nesam):

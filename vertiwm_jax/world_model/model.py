@@ -25,6 +25,8 @@ from vertiwm_jax.world_model.sizes import BASE, PAPER
 from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
 
 Part = Literal["transformer", "nesam", "gate"]
+Encoders = Literal["own", "shared"]
+"""Whether each specialist has a pair of encoders, or NeSAM sees through the Transformer's."""
 PRETRAINED = Path(__file__).parents[1] / "weights"
 """Folder of the model that comes with the package; its model card is `docs/model_card.md`."""
 _CONFIG = "model.yaml"
@@ -62,12 +64,14 @@ class VertiWMHistory:
 
     hidden: `[64]` of the gate; zeros where a window of prediction starts, in the paper.
     coefficients: `[4]` alpha that led to the current state; 0.5 before the first step.
+    disagreement: `[]` m between where the two would have moved it; 0 before the first step.
     """
 
     transformer: History
     nesam: History
     hidden: jax.Array
     coefficients: jax.Array
+    disagreement: jax.Array
 
     @property
     def perception(self) -> Perception:
@@ -87,6 +91,9 @@ class ModelConfig:
     """What the Transformer is told of the ground; less than patches only to compare with."""
     soil: SoilSource = "map"
     """Whether NeSAM uses the soils of the map or predicts them from what the ground looks like."""
+    encoders: Encoders = "own"
+    """Own ones for each specialist, as in the paper, or one pair that both share: half the cost
+    where both learn from the same ground."""
     gate_terrain: GateTerrain = "mean"
     """What the gate reads of the ground."""
     coefficients: Literal["grouped", "scalar"] = "grouped"
@@ -99,6 +106,8 @@ class ModelConfig:
             raise ValueError(f"parts: expected both specialists with the gate, found {self.parts}")
         if "gate" in self.parts and self.terrain != "patches":
             raise ValueError(f"terrain: expected patches for the gate, found {self.terrain!r}")
+        if self.encoders == "shared" and not {"transformer", "nesam"} <= set(self.parts):
+            raise ValueError(f"encoders: expected two parts to share them, found {self.parts}")
 
     @property
     def transformer(self) -> TransformerSpecialist:
@@ -112,7 +121,9 @@ class ModelConfig:
 
     def build(self) -> "VertiWM":
         """Both fused."""
-        return VertiWM(self.transformer, self.nesam, self.gate_terrain, self.coefficients)
+        return VertiWM(
+            self.transformer, self.nesam, self.encoders, self.gate_terrain, self.coefficients
+        )
 
     def init_params(
         self,
@@ -133,6 +144,7 @@ class ModelConfig:
 class VertiWM:
     """Fuses a learned specialist for rigid ground with a physical one for soil (Sec. IV-C).
 
+    encoders: "shared" if NeSAM's are the Transformer's, so that the ground is encoded only once.
     gate_terrain: what the gate reads of the ground.
     coefficients: "grouped" for one each of planar and vertical motion, tilt and yaw; "scalar"
         for a single one, from the mean of the gate's outputs.
@@ -140,6 +152,7 @@ class VertiWM:
 
     transformer: Specialist
     nesam: Specialist
+    encoders: Encoders = "own"
     gate_terrain: GateTerrain = "mean"
     coefficients: Literal["grouped", "scalar"] = "grouped"
 
@@ -163,12 +176,14 @@ class VertiWM:
         self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState
     ) -> VertiWMHistory:
         """Both specialists' histories, a gate without memory."""
-        return VertiWMHistory(
+        history = VertiWMHistory(
             self.transformer.init(params.transformer, terrain, state),
             self.nesam.init(params.nesam, terrain, state),
             hidden=jnp.zeros(HIDDEN),
             coefficients=jnp.full(4, 0.5),
+            disagreement=jnp.float32(0),
         )
+        return self._seeing(params, terrain, history, state)
 
     def step(
         self,
@@ -183,7 +198,8 @@ class VertiWM:
         context = fusion.context(state, command, first, second, self.gate_terrain)
         alpha, hidden = self._weigh(params.gate, context, history.hidden)
         state = fusion.fuse(state, first, second, alpha)
-        following = replace(following, hidden=hidden, coefficients=alpha)
+        apart = jnp.linalg.norm((second.increment - first.increment)[:3])
+        following = replace(following, hidden=hidden, coefficients=alpha, disagreement=apart)
         return state, self._seeing(params, terrain, following, state)
 
     def context_along(
@@ -243,12 +259,13 @@ class VertiWM:
         history: VertiWMHistory,
         state: VehicleState,
     ) -> VertiWMHistory:
-        """The history with what both see at a state, each through encoders of its own."""
+        """The history with what both see at a state."""
         patches = self.transformer.exteroception.query(terrain, state)
-        by_transformer = self.transformer.perceive(params.transformer, patches)
-        if self.nesam.exteroception.patches != self.transformer.exteroception.patches:
-            patches = self.nesam.exteroception.query(terrain, state)
-        by_nesam = self.nesam.perceive(params.nesam, patches)
+        by_transformer = by_nesam = self.transformer.perceive(params.transformer, patches)
+        if self.encoders == "own":
+            if self.nesam.exteroception.patches != self.transformer.exteroception.patches:
+                patches = self.nesam.exteroception.query(terrain, state)
+            by_nesam = self.nesam.perceive(params.nesam, patches)
         return replace(
             history,
             transformer=replace(history.transformer, perception=by_transformer),
