@@ -103,7 +103,7 @@ def learned(config: TrainConfig, terrain: TerrainMap, run: Path) -> Rows:
     terrain: any worlds that tests can be drawn on.
     """
     tasks = ground.test_tasks(config.ground, terrain)
-    made = task.environment(config, config.model, terrain, tasks)
+    made = task.environment(config, config.model, terrain, tasks, config.variation)
     algorithm, params = config.algorithm(made.env), made.params
     restored = restore(algorithm, params, run, config.loop.seeds)
     if restored is None:

@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import chex
 import jax
@@ -6,9 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from env.worlds import BICYCLE, Scripted, bicycle_env, ground, hills, task
+from flax import struct
 
 from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.env.reward import RewardConfig
 from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
@@ -35,10 +37,10 @@ def drive(x, y=0.0, z=0.47, roll=0.0, speed=4.0):
     )
 
 
-def play(script, steps, terrain=OPEN, goal=(30.0, 0.0), **settings):
+def play(script, steps, terrain=OPEN, goal=(30.0, 0.0), model=Scripted, **settings):
     """Outputs of `steps` steps of a script that starts at (0, 0)."""
     config = NavigationConfig(**settings)
-    env = NavigationEnv(Scripted(config.settle_steps), config)
+    env = NavigationEnv(model(config.settle_steps), config)
     params = env.make_params(script, terrain, task((0.0, 0.0), goal))
     _, state = env.start(params, 0)
     outputs = []
@@ -84,6 +86,38 @@ def test_an_episode_that_is_over_stays_as_it_is(last):
     assert float(end[2]) != 0 and float(after[2]) == 0
     kept = [replace(state, history=()) for _, state, *_ in (end, after)]
     chex.assert_trees_all_equal((end[0], kept[0], *end[3:]), (after[0], kept[1], *after[3:]))
+
+
+@struct.dataclass
+class Divided:
+    """A history of parts that disagree."""
+
+    steps: jax.Array
+    disagreement: jax.Array
+
+
+@dataclass(frozen=True)
+class Doubtful(Scripted):
+    """The script, by parts that are 1 cm more apart after every step that moved."""
+
+    def init(self, params, terrain, state):
+        return Divided(super().init(params, terrain, state), jnp.float32(0))
+
+    def step(self, params, terrain, history, state, command):
+        state, steps = super().step(params, terrain, history.steps, state, command)
+        return state, Divided(steps, 0.01 * jnp.maximum(steps, 0))
+
+
+def test_disagreement_within_a_model_costs_reward_and_ends_what_nobody_can_tell():
+    script = drive([1.0, 2.0, 3.0, np.nan])
+    alone = play(script, 4)
+    settings = {"reward": RewardConfig(disagreement=100.0)}
+    divided = play(script, 4, model=Doubtful, **settings)
+    for number, (one, other) in enumerate(zip(alone[:3], divided, strict=False), start=1):
+        np.testing.assert_allclose(other[2], one[2] - number, rtol=1e-4)
+    assert endings(divided)[-1] == "DIVERGED" and jnp.isfinite(divided[-1][2])
+    ended = play(script, 3, model=Doubtful, plausible_disagreement=0.025)
+    assert endings(ended) == ["RUNNING", "RUNNING", "DIVERGED"]
 
 
 def test_standing_is_stuck_only_without_a_break():

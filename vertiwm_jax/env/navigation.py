@@ -10,12 +10,13 @@ import numpy as np
 from flax import struct
 from gymnax.environments import environment, spaces
 
-from vertiwm_jax.dynamics import Dynamics, History, Params
+from vertiwm_jax.dynamics import Dynamics, History, Params, disagreement
 from vertiwm_jax.env import observation, tasks
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.reward import RewardConfig, reward
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending, edge_distance, first_ending, is_terminal
+from vertiwm_jax.env.variation import Variation, VariationConfig
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -33,6 +34,7 @@ class NavigationConfig:
     rollover_angle: rad of roll or of pitch.
     stalled_speed, stuck_seconds: slower than this is stalled, for this long without a break stuck.
     plausible_speed, plausible_height: m/s, and m from the ground, beyond which a model diverged.
+    plausible_disagreement: m by which its parts may disagree in a step before it has diverged.
     settle_steps: steps of standing still before a start is handed out.
     """
 
@@ -46,6 +48,7 @@ class NavigationConfig:
     stuck_seconds: float = 5.0
     plausible_speed: float = 30.0
     plausible_height: float = 4.0
+    plausible_disagreement: float = np.inf
     settle_steps: int = 15
     chassis: Chassis = dataclasses.field(default_factory=Chassis)
     reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
@@ -73,6 +76,7 @@ class NavigationState(environment.EnvState):
     action: `[2]` the last one, in [-1, 1].
     time: `[]` int32 steps done; stalled: `[]` int32 steps stalled without a break.
     ending: `[]` int32 `Ending` code.
+    variation: how this episode differs from what the map says.
     """
 
     vehicle: VehicleState
@@ -82,6 +86,7 @@ class NavigationState(environment.EnvState):
     action: jax.Array
     stalled: jax.Array
     ending: jax.Array
+    variation: Variation
 
 
 @struct.dataclass(kw_only=True)
@@ -109,12 +114,13 @@ class NavigationParams(environment.EnvParams):
 class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
     """Drives to a goal with actions in [-1, 1]^2, speed and steering, at 10 Hz.
 
-    Two environments of equal `dynamics` and `config` are equal and share compiled code. There
-    are no default parameters: a ground must be chosen, see `make_params`.
+    Two environments of equal `dynamics`, `config` and `variation` are equal and share compiled
+    code. There are no default parameters: a ground must be chosen, see `make_params`.
     """
 
     dynamics: Dynamics
     config: NavigationConfig = dataclasses.field(default_factory=NavigationConfig)
+    variation: VariationConfig = VariationConfig()
 
     def __post_init__(self) -> None:
         chassis = self.config.chassis
@@ -139,8 +145,10 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
     def reset_env(
         self, key: jax.Array, params: NavigationParams
     ) -> tuple[jax.Array, NavigationState]:
-        """A start drawn evenly from the pool."""
-        return self.start(params, jax.random.randint(key, (), 0, params.pool_size))
+        """A start drawn evenly from the pool, and how the episode varies."""
+        seen, state = self.start(params, jax.random.randint(key, (), 0, params.pool_size))
+        variation = Variation.draw(self.variation, jax.random.fold_in(key, 1), state.action)
+        return seen, dataclasses.replace(state, variation=variation)
 
     def step_env(
         self,
@@ -151,17 +159,20 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
     ) -> tuple[jax.Array, NavigationState, jax.Array, jax.Array, dict[Any, Any]]:
         """One step of 0.1 s; a state that diverged is replaced by the last plausible one.
 
-        An episode that is over stays as it is, and gives no reward. Only its history goes on: to
-        keep that, all of it would be copied in every step.
+        An episode that is over stays as it is, and gives no reward. Only its history goes on, and
+        what is on its way to the vehicle: to keep that, all would be copied in every step.
         """
         config = self.config
         terrain = params.terrain.select(state.world)
         action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
+        arriving, variation = state.variation.arriving(action)
+        ground, command = state.variation.ground(terrain), config.command(arriving)
         moved, history = self.dynamics.step(
-            params.dynamics, terrain, state.history, state.vehicle, config.command(action)
+            params.dynamics, ground, state.history, state.vehicle, command
         )
         running = state.ending == Ending.RUNNING
-        plausible = self._is_plausible(terrain, moved)
+        apart = disagreement(history)
+        plausible = self._is_plausible(terrain, moved, apart)
         vehicle, action = jax.tree.map(
             lambda new, old: jnp.where(running & plausible, new, old),
             (moved, action),
@@ -201,6 +212,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
             roll=roll,
             pitch=pitch,
             vertical_speed=climb / STEP_SECONDS,
+            disagreement=jnp.where(plausible, apart, 0.0),
             ending=ending,
         )
         gain = jnp.where(running, gain, 0.0)
@@ -212,6 +224,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
             time=time,
             stalled=stalled,
             ending=ending,
+            variation=variation,
         )
         info = {
             "ending": ending,
@@ -257,12 +270,15 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         limit = observation.OBSERVATION_LIMIT
         return spaces.Box(-limit, limit, (observation.OBSERVATION_SIZE,), jnp.float32)
 
-    def _is_plausible(self, terrain: TerrainMap, vehicle: VehicleState) -> jax.Array:
+    def _is_plausible(
+        self, terrain: TerrainMap, vehicle: VehicleState, apart: jax.Array
+    ) -> jax.Array:
         off_ground = vehicle.position[2] - query.height(terrain, vehicle.position[:2])
         return (
             jnp.all(jnp.isfinite(vehicle.vector))
             & (jnp.linalg.norm(vehicle.velocity) <= self.config.plausible_speed)
             & (jnp.abs(off_ground) <= self.config.plausible_height)
+            & (apart <= self.config.plausible_disagreement)
         )
 
 
@@ -321,6 +337,7 @@ def _settle(
             action=action,
             stalled=zero,
             ending=zero,
+            variation=Variation.draw(env.variation, jax.random.key(0), action),
         )
         return state, observation.observe(selected, env.config.chassis, vehicle, goal, action)
 

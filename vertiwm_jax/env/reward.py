@@ -20,6 +20,7 @@ class RewardConfig:
     vertical: for each m/s of vertical speed, each step.
     goal, stuck, failure: once, at the ending; failure is any other terminal ending.
     timed_out, timed_out_distance: once, and for each metre that is left then.
+    disagreement: for each metre that the parts of a model disagree, each step.
     """
 
     progress: float = 50.0
@@ -32,6 +33,7 @@ class RewardConfig:
     failure: float = 600.0
     timed_out: float = 100.0
     timed_out_distance: float = 10.0
+    disagreement: float = 0.0
 
 
 def reward(
@@ -43,12 +45,13 @@ def reward(
     roll: jax.Array,
     pitch: jax.Array,
     vertical_speed: jax.Array,
+    disagreement: jax.Array,
     ending: jax.Array,
 ) -> jax.Array:
     """`[...]` reward of one 0.1 s step.
 
     progress: m that the goal came nearer; distance: m left; stalled: bool; roll, pitch: rad;
-    vertical_speed: m/s in the world frame; ending: `Ending` codes.
+    vertical_speed: m/s in the world frame; disagreement: m; ending: `Ending` codes.
     """
 
     def tilt_penalty(angle: jax.Array) -> jax.Array:
@@ -70,5 +73,6 @@ def reward(
         - config.stalled * stalled
         - config.tilt * (tilt_penalty(roll) + tilt_penalty(pitch))
         - config.vertical * jnp.abs(vertical_speed)
+        - config.disagreement * disagreement
         + at_end
     )

@@ -10,6 +10,7 @@ from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv, NavigationParams
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.variation import VariationConfig
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.rl import ground
@@ -30,6 +31,8 @@ class TaskConfig:
     """What worlds and tasks."""
     navigation: NavigationConfig = NavigationConfig()
     """What the task is."""
+    variation: VariationConfig = VariationConfig()
+    """How episodes differ from what map and model say, while learning."""
     model: ModelName = "builtin"
     """What moves the vehicle while learning; tests after it are in the built-in simulator."""
     weights: Path | None = None
@@ -60,7 +63,8 @@ def environments(config: TaskConfig) -> tuple[Task, Task]:
     terrain, held_out = ground.grounds(config.ground, config.worlds, config.key("worlds"))
     chassis = config.navigation.chassis
     tasks = ground.training_tasks(config.ground, terrain, chassis, config.key("tasks"))
-    return environment(config, config.model, terrain, tasks), test_environment(config, held_out)
+    training = environment(config, config.model, terrain, tasks, config.variation)
+    return training, test_environment(config, held_out)
 
 
 def held_out(config: TaskConfig) -> TerrainMap:
@@ -76,10 +80,16 @@ def test_environment(config: TaskConfig, terrain: TerrainMap, model: ModelName =
     return environment(config, model, terrain, ground.test_tasks(config.ground, terrain))
 
 
-def environment(config: TaskConfig, model: ModelName, terrain: TerrainMap, tasks: Tasks) -> Task:
+def environment(
+    config: TaskConfig,
+    model: ModelName,
+    terrain: TerrainMap,
+    tasks: Tasks,
+    variation: VariationConfig = VariationConfig(),
+) -> Task:
     """Tasks inside one of the models."""
     moves, params = dynamics(config, model)
-    env = NavigationEnv(moves, config.navigation)
+    env = NavigationEnv(moves, config.navigation, variation)
     return Task(env, env.make_params(params, terrain, tasks))
 
 

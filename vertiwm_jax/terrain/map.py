@@ -54,6 +54,7 @@ class TerrainMap:
     soils: leaves `[K]`; rows of rigid classes are never used but finite.
     world: `[]` int32, the selected world.
     class_names: K names, static.
+    grip: `[]` what all friction is multiplied by; None for 1.
     """
 
     elevation: jax.Array
@@ -68,6 +69,7 @@ class TerrainMap:
     soils: Soil
     world: jax.Array
     class_names: tuple[str, ...] = struct.field(pytree_node=False)
+    grip: jax.Array | None = None
 
     @property
     def worlds(self) -> int:

@@ -120,7 +120,10 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
     slope_y = up + twist * jnp.where(soft, fx, jnp.where(rising, 1.0, 0.0))
     gradient = jnp.stack([slope_x, slope_y], axis=-1) / terrain.resolution
     gradient = jnp.where(_inside(terrain, xy), gradient, 0.0)
-    return Surface(height, gradient, semantic, _gather(terrain.friction, cell))
+    friction = _gather(terrain.friction, cell)
+    if terrain.grip is not None:
+        friction = terrain.grip * friction
+    return Surface(height, gradient, semantic, friction)
 
 
 def height(terrain: TerrainMap, xy: jax.Array) -> jax.Array:

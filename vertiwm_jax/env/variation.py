@@ -1,0 +1,84 @@
+"""What an episode keeps to itself: ground and commands that are not quite what the map says.
+
+A policy that has met weaker soil, less grip and late commands while it learned relies less on what
+is peculiar to its model (Peng et al., 2018, "Sim-to-real transfer with dynamics randomization").
+"""
+
+import dataclasses
+from typing import Self
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from vertiwm_jax.terrain.map import TerrainMap
+
+_STRENGTH = "kc", "kphi", "cohesion"
+
+
+@dataclasses.dataclass(frozen=True)
+class VariationConfig:
+    """Least and most of what each episode draws evenly; nothing varies by default."""
+
+    grip: tuple[float, float] = (1.0, 1.0)
+    """Factor of the friction of rigid ground."""
+    soil: tuple[float, float] = (1.0, 1.0)
+    """Factor of how stiff and how cohesive all soils are."""
+    delay: tuple[int, int] = (0, 0)
+    """Steps of 0.1 s that commands come late."""
+
+    def __post_init__(self):
+        for name, least in (("grip", 0.01), ("soil", 0.01), ("delay", 0)):
+            low, high = getattr(self, name)
+            if not least <= low <= high:
+                raise ValueError(
+                    f"{name}: expected least and most, from {least} up, found {low} and {high}"
+                )
+
+
+@struct.dataclass
+class Variation:
+    """What one episode has drawn; None, or no action, stands for what does not vary.
+
+    grip, soil: `[]` factors. delay: `[]` int32 steps. sent: `[D, 2]` the last actions, the latest
+    first, of which D is the longest delay.
+    """
+
+    grip: jax.Array | None
+    soil: jax.Array | None
+    delay: jax.Array | None
+    sent: jax.Array
+
+    @classmethod
+    def draw(cls, config: VariationConfig, key: jax.Array, action: jax.Array) -> Self:
+        """That of an episode before which `[2]` action was sent."""
+        grip, soil, delay = jax.random.split(key, 3)
+
+        def factor(key: jax.Array, span: tuple[float, float]) -> jax.Array | None:
+            low, high = span
+            return None if low == high == 1.0 else jax.random.uniform(key, (), None, low, high)
+
+        shortest, longest = config.delay
+        return cls(
+            factor(grip, config.grip),
+            factor(soil, config.soil),
+            jax.random.randint(delay, (), shortest, longest + 1) if longest else None,
+            sent=jnp.broadcast_to(action, (longest, 2)),
+        )
+
+    def ground(self, terrain: TerrainMap) -> TerrainMap:
+        """The ground that the vehicle meets where the map says `terrain`."""
+        if self.grip is not None:
+            terrain = dataclasses.replace(terrain, grip=self.grip)
+        if self.soil is not None:
+            weaker = {x: self.soil * getattr(terrain.soils, x) for x in _STRENGTH}
+            soils = dataclasses.replace(terrain.soils, **weaker)
+            terrain = dataclasses.replace(terrain, soils=soils)
+        return terrain
+
+    def arriving(self, action: jax.Array) -> tuple[jax.Array, Self]:
+        """The action `[2]` that the vehicle follows when `action` is sent, and what comes next."""
+        if self.delay is None:
+            return action, self
+        sent = jnp.concatenate([action[None], self.sent])
+        return sent[self.delay], dataclasses.replace(self, sent=sent[:-1])
