@@ -3,6 +3,13 @@ import signal
 
 # The suite is a statement about the CPU in float32; before anything imports jax.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# Compiling is most of what the tests do, and three times as fast without optimisation. To test what
+# users run, set XLA_FLAGS to nothing.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
+    "--xla_cpu_use_fusion_emitters=false",
+)
 
 import jax
 import pytest
