@@ -120,6 +120,16 @@ def test_disagreement_within_a_model_costs_reward_and_ends_what_nobody_can_tell(
     assert endings(ended) == ["RUNNING", "RUNNING", "DIVERGED"]
 
 
+def test_many_starts_are_those_of_each():
+    terrain = ground(hills())
+    many = circle_tasks(terrain, radius=50.0, pairs=300)
+    some = jax.tree.map(lambda x: x[250:260], many)
+    (_, all_), (_, few) = (bicycle_env(terrain, tasks) for tasks in (many, some))
+    assert all_.pool_size == 300
+    picked = jax.tree.map(lambda x: x[250:260], (all_.starts, all_.start_observation))
+    chex.assert_trees_all_close(picked, (few.starts, few.start_observation), atol=1e-4)
+
+
 def test_standing_is_stuck_only_without_a_break():
     speed = np.full(40, 0.1)
     speed[9] = 1.0

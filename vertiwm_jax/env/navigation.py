@@ -21,6 +21,8 @@ from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
 
+_SETTLED_TOGETHER = 256
+
 
 @dataclasses.dataclass(frozen=True)
 class NavigationConfig:
@@ -341,4 +343,10 @@ def _settle(
         )
         return state, observation.observe(selected, env.config.chassis, vehicle, goal, action)
 
-    return jax.vmap(settle)(pool)
+    # Not all at once: patches of thousands of vehicles fill gigabytes.
+    count = len(pool.world)
+    batch = min(count, _SETTLED_TOGETHER)
+    batches = -(-count // batch)
+    rows = (jnp.arange(batches * batch) % count).reshape(batches, batch)
+    settled = jax.lax.map(jax.vmap(settle), jax.tree.map(lambda x: x[rows], pool))
+    return jax.tree.map(lambda x: x.reshape(rows.size, *x.shape[2:])[:count], settled)

@@ -38,16 +38,16 @@ class VariationConfig:
 
 @struct.dataclass
 class Variation:
-    """What one episode has drawn; None, or no action, stands for what does not vary.
+    """What one episode has drawn; None stands for what does not vary.
 
     grip, soil: `[]` factors. delay: `[]` int32 steps. sent: `[D, 2]` the last actions, the latest
-    first, of which D is the longest delay.
+    first; D is the longest delay.
     """
 
     grip: jax.Array | None
     soil: jax.Array | None
     delay: jax.Array | None
-    sent: jax.Array
+    sent: jax.Array | None
 
     @classmethod
     def draw(cls, config: VariationConfig, key: jax.Array, action: jax.Array) -> Self:
@@ -58,13 +58,13 @@ class Variation:
             low, high = span
             return None if low == high == 1.0 else jax.random.uniform(key, (), None, low, high)
 
+        drawn = cls(factor(grip, config.grip), factor(soil, config.soil), delay=None, sent=None)
         shortest, longest = config.delay
-        return cls(
-            factor(grip, config.grip),
-            factor(soil, config.soil),
-            jax.random.randint(delay, (), shortest, longest + 1) if longest else None,
-            sent=jnp.broadcast_to(action, (longest, 2)),
-        )
+        if not longest:
+            return drawn
+        steps = jax.random.randint(delay, (), shortest, longest + 1)
+        sent = jnp.broadcast_to(action, (longest, 2))
+        return dataclasses.replace(drawn, delay=steps, sent=sent)
 
     def ground(self, terrain: TerrainMap) -> TerrainMap:
         """The ground that the vehicle meets where the map says `terrain`."""
@@ -78,7 +78,7 @@ class Variation:
 
     def arriving(self, action: jax.Array) -> tuple[jax.Array, Self]:
         """The action `[2]` that the vehicle follows when `action` is sent, and what comes next."""
-        if self.delay is None:
+        if self.delay is None or self.sent is None:
             return action, self
         sent = jnp.concatenate([action[None], self.sent])
         return sent[self.delay], dataclasses.replace(self, sent=sent[:-1])
