@@ -155,11 +155,13 @@ class _Pipeline:
         if self.start is None and params.encoders is not None:
             patches = replace(self.config.patches, patches=specialist.exteroception.patches)
             places = cache(lambda: PatchData.of(patches, *drives()))
-            problem, seeing, schedule = AutoencoderProblem(patches), name, config.autoencoders
+            seeing, schedule = name, config.autoencoders
             if self.config.model.encoders == "shared":
                 seeing, schedule = "transformer", self.config.transformer.autoencoders
+            problem = AutoencoderProblem(patches)
+            pair = problem.init_params(self._key(seeing))
             stage = f"{seeing}_autoencoders", problem, schedule, kinds
-            pair, digest = self._fit(*stage, problem.init_params(self._key(seeing)), places)
+            pair, digest = self._fit(*stage, pair, places)
             before = (digest,)
             params = replace(params, encoders=autoencoders.encoders(pair))
             if isinstance(specialist, Nesam):

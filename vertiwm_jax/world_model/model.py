@@ -64,7 +64,8 @@ class VertiWMHistory:
 
     hidden: `[64]` of the gate; zeros where a window of prediction starts, in the paper.
     coefficients: `[4]` alpha that led to the current state; 0.5 before the first step.
-    disagreement: `[]` m between where the two would have moved it; 0 before the first step.
+    disagreement: `[]` m between where the two would have moved it, without a gradient; 0 before
+        the first step.
     """
 
     transformer: History
@@ -198,7 +199,7 @@ class VertiWM:
         context = fusion.context(state, command, first, second, self.gate_terrain)
         alpha, hidden = self._weigh(params.gate, context, history.hidden)
         state = fusion.fuse(state, first, second, alpha)
-        apart = jnp.linalg.norm((second.increment - first.increment)[:3])
+        apart = jnp.linalg.norm(jax.lax.stop_gradient(second.increment - first.increment)[:3])
         following = replace(following, hidden=hidden, coefficients=alpha, disagreement=apart)
         return state, self._seeing(params, terrain, following, state)
 
