@@ -213,7 +213,8 @@ def test_training_inside_a_world_model_and_judged_in_the_simulator(train, tmp_pa
     config = ModelConfig()
     params = config.init_params(jax.random.key(0), choose("builtin")[1])
     model.save(tmp_path / "model", config, params)
-    run = train("--model", "vertiwm", "--weights", str(tmp_path / "model"))
+    varied = ["--variation.grip", "0.6", "1.0", "--variation.delay", "0", "2"]
+    run = train("--model", "vertiwm", "--weights", str(tmp_path / "model"), *varied)
     assert "training in vertiwm on 2 worlds" in capsys.readouterr().out
     assert all(np.isfinite(line["policy_loss"]) for line in runs.read_metrics(run))
     evaluate.main(["navigation", "--policy", str(run)])

@@ -143,6 +143,7 @@ def _policies(
 def train_and_report(config: TrainConfig) -> Path:
     """Trains, or goes on with, a policy, tests it, and gives the folder of the run."""
     keep_compiled(config.compile_cache)
+    print("drawing worlds, and placing vehicles on them ...", flush=True)
     try:
         training, test = task.environments(config)
     except ValueError as error:  # what is wrong with the maps, or with the tasks on them
