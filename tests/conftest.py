@@ -14,7 +14,7 @@ os.environ.setdefault(
 import jax
 import pytest
 
-# One core for each of several workers. With more threads XLA's results differ from call to call
+# One core for each of several workers. With more threads results may differ from call to call
 # (jax-ml/jax#39741), and workers only get in each other's way.
 worker = os.environ.get("PYTEST_XDIST_WORKER")
 if worker and hasattr(os, "sched_setaffinity"):
