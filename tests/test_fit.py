@@ -178,7 +178,7 @@ def test_one_specialist_alone_is_fitted_and_compared(fitted, folder, tmp_path, c
         ({"parts": ()}, "at least one"),
         ({"parts": ("gate", "nesam")}, "both specialists"),
         ({"terrain": "none"}, "patches for the gate"),
-        ({"parts": ("nesam",), "encoders": "shared"}, "two parts"),
+        ({"parts": ("nesam",), "encoders": "shared"}, "own ones for nesam alone"),
     ],
 )
 def test_models_without_sense_are_refused(settings, words):

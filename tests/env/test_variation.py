@@ -74,7 +74,7 @@ def test_grip_scales_friction_and_soil_its_strength_wherever_the_ground_is_asked
 
 
 def test_a_vehicle_climbs_less_on_varied_ground():
-    """Half the grip on a slope of rigid ground: the simulator, unlike a bicycle, slides back."""
+    """A third of the grip on a slope of rigid ground: the simulator, unlike a bicycle, slips."""
     slope = np.broadcast_to(0.45 * np.arange(129.0) * 0.1, (129, 129)).astype(np.float32)
     hill = terrain_map.build(slope, np.full((16, 16), 3), resolution=0.1, origin=(-6.4, 6.4))
     model, params = Simulator(), chrono_like(hmmwv())

@@ -21,7 +21,7 @@ from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
 
-_SETTLED_TOGETHER = 256
+_SETTLED_TOGETHER = 256  # vehicles, of which each has patches in every step
 
 
 @dataclasses.dataclass(frozen=True)

@@ -108,7 +108,7 @@ class ModelConfig:
         if "gate" in self.parts and self.terrain != "patches":
             raise ValueError(f"terrain: expected patches for the gate, found {self.terrain!r}")
         if self.encoders == "shared" and not {"transformer", "nesam"} <= set(self.parts):
-            raise ValueError(f"encoders: expected two parts to share them, found {self.parts}")
+            raise ValueError(f"encoders: expected own ones for {self.parts[0]} alone, found shared")
 
     @property
     def transformer(self) -> TransformerSpecialist:
