@@ -118,7 +118,9 @@ def test_other_algorithms_leave_the_same_and_resume(door, folder, tmp_path):
     name = door.__name__.split(".")[-1]
     settings = "{transitions: 192, num_envs: 8, num_steps: 8, updates: 1, batch: 8, capacity: 64, "
     settings += "warm_up: 64, hidden: [8]}"
-    tiny = TINY[: TINY.index("planning")] + f"{name}: {settings}\nloop: {{checkpoint_every: 2}}\n"
+    # Policies that also see the ground by the world model's encoders.
+    tiny = TINY[: TINY.index("planning")].replace("settle_steps", "embeddings: true, settle_steps")
+    tiny += f"{name}: {settings}\nloop: {{checkpoint_every: 2}}\n"
     (tmp_path / "tiny.yaml").write_text(tiny)
     with opened(door.main, folder, "--config", str(tmp_path / "tiny.yaml")) as train:
         run = train()

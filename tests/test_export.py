@@ -21,7 +21,7 @@ from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZE
 from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.evaluation.controllers import LookAhead, StraightToGoal
-from vertiwm_jax.networks.policy import Actor, SquashedActor
+from vertiwm_jax.networks.policy import Actor, Senses, SquashedActor
 from vertiwm_jax.rl import task as tasks
 from vertiwm_jax.rl.learned import Corrected, MeanAction
 from vertiwm_jax.rl.normalise import RunningStatistics
@@ -31,9 +31,9 @@ from vertiwm_jax.terrain import map as terrain_map
 
 CONFIG = NavigationConfig(speed_range=(-1.0, 5.0))
 ACTORS = {
-    "ppo": Actor(2, (8, 6, 5), -0.5, ARCS),
-    "sac": SquashedActor(2, (8, 6), -0.5, ARCS),
-    "td3": SquashedActor(2, (8,), None, ARCS),
+    "ppo": Actor(2, (8, 6, 5), -0.5, Senses(ARCS)),
+    "sac": SquashedActor(2, (8, 6), -0.5, Senses(ARCS)),
+    "td3": SquashedActor(2, (8,), None, Senses(ARCS)),
 }
 BASES = {"look ahead": LookAhead(CONFIG), "straight to goal": StraightToGoal(CONFIG), "none": None}
 TINY = """
@@ -233,6 +233,8 @@ def test_what_cannot_be_exported_is_named_and_leaves_nothing(run_and_policy, tmp
     assert "seed: expected 0 to 1, found 2" in refusal(export.main, run, "--seed", 2)
     (tmp_path / "config.yaml").write_text(TINY)
     assert "expected checkpoints of a training" in refusal(export.main, tmp_path)
+    (tmp_path / "config.yaml").write_text(TINY.replace("settle", "embeddings: true, settle"))
+    assert "navigation.embeddings: expected" in refusal(export.main, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
     monkeypatch.delitem(sys.modules, "vertiwm_jax.deploy.onnx_graph")
     monkeypatch.setitem(sys.modules, "onnx", None)

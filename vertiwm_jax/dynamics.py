@@ -15,6 +15,8 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 Params = Any
 History = Any
+EMBEDDING_SHAPE = (16, 16, 36)
+"""Rows, the first farthest ahead; columns, the first farthest left; and features."""
 
 
 class Dynamics(Protocol):
@@ -44,6 +46,20 @@ def disagreement(history: History) -> jax.Array:
     A sign of what none of them has learned (Kidambi et al., 2020, "MOReL").
     """
     return getattr(history, "disagreement", jnp.float32(0))
+
+
+def embedding(history: History) -> jax.Array:
+    """`EMBEDDING_SHAPE` of the ground, as the model sees it at the state that `history` goes with.
+
+    `ValueError` for a model that sees none.
+    """
+    perception = getattr(history, "perception", None)
+    if perception is None:
+        raise ValueError(
+            "embeddings: expected a model that sees patches of the ground, found one that does "
+            "not; world_model.perception.Sighted gives it encoders"
+        )
+    return perception.latent
 
 
 def warm_up(

@@ -62,6 +62,11 @@ def restore(config: TrainConfig, run: Path, seed: int) -> Corrected | MeanAction
     seeds = config.loop.seeds
     if not 0 <= seed < seeds:
         raise ConfigError(f"{run}: seed: expected 0 to {seeds - 1}, found {seed}")
+    if config.navigation.embeddings:
+        raise ConfigError(
+            f"{run}: navigation.embeddings: expected a policy that sees the ground on arcs alone, "
+            "found one that needs encoders, which are not exported"
+        )
     # Checkpoints are read beside an environment of their kind, on any ground.
     level = terrain_map.build(np.zeros((129, 129)), np.zeros((1, 1), np.int32))
     policies = policy_training.learned(replace(config, planning=None), level, run)

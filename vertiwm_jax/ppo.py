@@ -6,7 +6,6 @@ from typing import ClassVar
 
 from vertiwm_jax import policy_training
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.observation import ARCS
 from vertiwm_jax.policy_training import TrainConfig
 from vertiwm_jax.rl import task
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
@@ -21,7 +20,7 @@ class PPOTraining(TrainConfig):
     """The algorithm."""
 
     def algorithm(self, env: NavigationEnv) -> PPO:
-        return PPO(self.repeated(env), self.ppo, task.outcomes, ARCS)
+        return PPO(self.repeated(env), self.ppo, task.outcomes, env.senses)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -6,7 +6,6 @@ from typing import ClassVar
 
 from vertiwm_jax import policy_training
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.observation import ARCS
 from vertiwm_jax.policy_training import TrainConfig
 from vertiwm_jax.rl import task
 from vertiwm_jax.rl.off_policy import OffPolicy
@@ -22,7 +21,7 @@ class SACTraining(TrainConfig):
     """The algorithm."""
 
     def algorithm(self, env: NavigationEnv) -> OffPolicy:
-        return OffPolicy(self.repeated(env), SAC(self.sac), task.outcomes, ARCS)
+        return OffPolicy(self.repeated(env), SAC(self.sac), task.outcomes, env.senses)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

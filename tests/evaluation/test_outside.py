@@ -6,6 +6,7 @@ import numpy as np
 from env.worlds import SNOW, hills
 
 from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
+from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation import navigation, outside
@@ -13,6 +14,7 @@ from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.simulators.builtin import BuiltIn
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.world_model.choice import sighted
 
 
 def test_the_built_in_simulator_outside_jit_is_that_inside():
@@ -26,10 +28,11 @@ def test_the_built_in_simulator_outside_jit_is_that_inside():
         yaw=jnp.array([0.3, 0.0, 1.0]),
         goal=jnp.array([[0.0, 0.0], [30.0, -30.0], [-50.0, 0.0]]),
     )
-    config = NavigationConfig(speed_range=(0.0, 5.0), horizon_seconds=6.0)
-    env = NavigationEnv(Simulator(), config)
-    params = env.make_params(chrono_like(hmmwv()), terrain, tasks)
-    arguments = env, params, jax.tree_util.Partial(full_speed), jax.random.key(0)
+    config = NavigationConfig(speed_range=(0.0, 5.0), horizon_seconds=6.0, embeddings=True)
+    moves = sighted("builtin", Simulator(), chrono_like(hmmwv()))
+    env = NavigationEnv(moves[0], config)
+    params = env.make_params(moves[1], terrain, tasks)
+    arguments = env, params, jax.tree_util.Partial(drawn_to_soil), jax.random.key(0)
     inside, found = navigation.evaluate(*arguments), outside.evaluate(BuiltIn, tasks, *arguments)
     assert found.ending.tolist() == [Ending.GOAL, Ending.COLLIDED, Ending.TIMED_OUT]
     for name in ("ending", "steps", "world"):
@@ -39,6 +42,6 @@ def test_the_built_in_simulator_outside_jit_is_that_inside():
         np.testing.assert_allclose(ours, theirs, atol=1e-2, err_msg=name)
 
 
-def full_speed(observation, key):
-    """Straight on."""
-    return jnp.array([1.0, 0.0])
+def drawn_to_soil(observation, key):
+    """Straight on, but for what the last of the embedded features says."""
+    return jnp.array([1.0, 0.01 * jnp.mean(observation[OBSERVATION_SIZE:])])

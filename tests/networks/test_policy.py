@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from vertiwm_jax.networks.policy import (
     Candidates,
     Critic,
     Gaussian,
+    Senses,
     Squashed,
     SquashedActor,
 )
@@ -78,7 +81,7 @@ def chosen_from(order):
         return seen[..., jnp.array(order), :], observation[..., 6:]
 
     actions = ((0.0, -1.0), (0.5, 0.0), (0.0, 1.0))
-    return Candidates(split, tuple(actions[i] for i in order))
+    return Senses(Candidates(split, tuple(actions[i] for i in order)))
 
 
 def trained(network):
@@ -118,6 +121,40 @@ def test_the_action_of_the_candidate_attended_to_is_taken():
     seen = jnp.array([[-1.0, 0, 1, 0, -1, 0], [-1, 0, -1, 0, 1, 0]])
     mean = actor.apply(params, jnp.concatenate([seen, jnp.zeros((2, 4))], -1)).mean
     np.testing.assert_allclose(mean, [[0.5, 0.0], [0.0, 1.0]], atol=1e-4)
+
+
+def test_the_picture_that_an_observation_ends_with_is_compressed():
+    shape = (8, 4, 3)
+    network = Critic((8,), Senses(image=shape))
+    pixels = jax.random.normal(jax.random.key(0), (5, *shape))
+    seen = jnp.concatenate([jnp.ones((5, 2)), pixels.reshape(5, -1)], axis=-1)
+    params = network.init(jax.random.key(1), seen)
+    # Two numbers beside the 16 that it is compressed to.
+    assert params["params"]["MLP_0"]["Dense_0"]["kernel"].shape == (18, 8)
+    gradient = jax.grad(lambda x: jnp.sum(network.apply(params, x)))(seen)
+    assert bool(jnp.all(gradient != 0))
+    gradients = jax.grad(lambda params: jnp.sum(network.apply(params, seen)))(params)
+    assert all(bool(jnp.any(x != 0)) for x in jax.tree.leaves(gradients["params"]["Compressor_0"]))
+
+
+def test_candidates_are_seen_before_the_picture():
+    alone, beside = chosen_from((0, 1, 2)), replace(chosen_from((0, 1, 2)), image=(4, 4, 1))
+    actor, params = Actor(2, (16,), -1.0, beside), None
+    observation = jax.random.normal(jax.random.key(2), (26,))
+    params = actor.init(jax.random.key(0), observation)
+    layers = params["params"]
+    attention = {**layers["Attention_0"]}
+    # A policy that does not care about the picture is the one that is not given it.
+    attention["Dense_0"] = {"kernel": attention["Dense_0"]["kernel"].at[4:].set(0.0)}
+    kernel = layers["MLP_0"]["Dense_0"]["kernel"].at[-16:].set(0.0)
+    mlp = {**layers["MLP_0"], "Dense_0": {**layers["MLP_0"]["Dense_0"], "kernel": kernel}}
+    blind = {**layers, "Attention_0": attention, "MLP_0": mlp}
+    attention = {**attention, "Dense_0": {"kernel": attention["Dense_0"]["kernel"][:4]}}
+    mlp = {**mlp, "Dense_0": {**mlp["Dense_0"], "kernel": kernel[:-16]}}
+    small = {"Attention_0": attention, "MLP_0": mlp, "log_std": layers["log_std"]}
+    expected = Actor(2, (16,), -1.0, alone).apply({"params": small}, observation[:10])
+    found = actor.apply({"params": blind}, observation)
+    np.testing.assert_allclose(found.mean, expected.mean, atol=1e-5)
 
 
 def test_density_of_squashed_actions_is_that_of_the_change_of_variables():

@@ -1,6 +1,7 @@
 """Goal navigation over any vehicle model, as a gymnax environment."""
 
 import dataclasses
+import math
 from functools import partial
 from typing import Any
 
@@ -10,13 +11,14 @@ import numpy as np
 from flax import struct
 from gymnax.environments import environment, spaces
 
-from vertiwm_jax.dynamics import Dynamics, History, Params, disagreement
+from vertiwm_jax.dynamics import EMBEDDING_SHAPE, Dynamics, History, Params, disagreement, embedding
 from vertiwm_jax.env import observation, tasks
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.reward import RewardConfig, reward
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending, edge_distance, first_ending, is_terminal
 from vertiwm_jax.env.variation import Variation, VariationConfig
+from vertiwm_jax.networks.policy import Senses
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -38,6 +40,7 @@ class NavigationConfig:
     plausible_speed, plausible_height: m/s, and m from the ground, beyond which a model diverged.
     plausible_disagreement: m by which its parts may disagree in a step before it has diverged.
     settle_steps: steps of standing still before a start is handed out.
+    embeddings: whether an observation ends with the ground as the model's encoders see it.
     """
 
     goal_radius: float = 8.0
@@ -52,6 +55,7 @@ class NavigationConfig:
     plausible_height: float = 4.0
     plausible_disagreement: float = np.inf
     settle_steps: int = 15
+    embeddings: bool = False
     chassis: Chassis = dataclasses.field(default_factory=Chassis)
     reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
 
@@ -243,12 +247,9 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         action: int | float | jax.Array | None,
         params: NavigationParams,
     ) -> jax.Array:
-        """`[O]` float32, see `observation.observe`."""
+        """`[O]` float32, see `observation.observe`, and the model's embedding of the ground."""
         del key, action
-        terrain = params.terrain.select(state.world)
-        return observation.observe(
-            terrain, self.config.chassis, state.vehicle, state.goal, state.action
-        )
+        return self._see(params.terrain.select(state.world), state)
 
     def is_terminated(self, state: NavigationState, params: NavigationParams) -> jax.Array:
         """Whether the task itself is over."""
@@ -269,8 +270,22 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
 
     def observation_space(self, params: NavigationParams | None = None) -> spaces.Box:
         """Every entry within the observation's limit."""
-        limit = observation.OBSERVATION_LIMIT
-        return spaces.Box(-limit, limit, (observation.OBSERVATION_SIZE,), jnp.float32)
+        limit, size = observation.OBSERVATION_LIMIT, observation.OBSERVATION_SIZE
+        size += math.prod(self.senses.image or (0,))
+        return spaces.Box(-limit, limit, (size,), jnp.float32)
+
+    @property
+    def senses(self) -> Senses:
+        """How networks should read observations."""
+        return Senses(observation.ARCS, EMBEDDING_SHAPE if self.config.embeddings else None)
+
+    def _see(self, terrain: TerrainMap, state: NavigationState) -> jax.Array:
+        chassis, limit = self.config.chassis, observation.OBSERVATION_LIMIT
+        seen = observation.observe(terrain, chassis, state.vehicle, state.goal, state.action)
+        if not self.config.embeddings:
+            return seen
+        embedded = jnp.clip(embedding(state.history).ravel(), -limit, limit)
+        return jnp.concatenate([seen, embedded])
 
     def _is_plausible(
         self, terrain: TerrainMap, vehicle: VehicleState, apart: jax.Array
@@ -341,7 +356,7 @@ def _settle(
             ending=zero,
             variation=Variation.draw(env.variation, jax.random.key(0), action),
         )
-        return state, observation.observe(selected, env.config.chassis, vehicle, goal, action)
+        return state, env._see(selected, state)
 
     # Not all at once: patches of thousands of vehicles fill gigabytes.
     count = len(pool.world)

@@ -1,7 +1,6 @@
 """How well a policy drives in a simulator outside jit: the same task, one episode at a time."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,7 +15,6 @@ from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation.navigation import NavigationResult
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.simulators import following
-from vertiwm_jax.simulators.following import Followed
 from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -33,7 +31,7 @@ def evaluate(
 
     tasks: of which `params` has the starts.
     """
-    env = replace(env, dynamics=Followed())
+    env = following.followed(env)
     driver = policy if isinstance(policy, Driver) else Reactive(policy)
     episodes = []
     with Progress(params.pool_size, "episodes") as progress:

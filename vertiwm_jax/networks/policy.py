@@ -92,6 +92,47 @@ class Candidates:
     actions: tuple[tuple[float, ...], ...]
 
 
+@dataclass(frozen=True)
+class Senses:
+    """How networks read an observation; as it is, by default.
+
+    candidates: actions that they weigh against each other.
+    image: shape `(h, w, c)` of what its last h w c numbers are a picture of, which each network
+        learns to compress to 16 numbers; h and w are multiples of 4.
+    """
+
+    candidates: Candidates | None = None
+    image: tuple[int, int, int] | None = None
+
+    def read(self, observation: jax.Array) -> jax.Array:
+        """The observation `[..., O]` with its picture compressed: `[..., O - h w c + 16]`.
+
+        Part of a module's compact method.
+        """
+        if self.image is None:
+            return observation
+        pixels = math.prod(self.image)
+        picture = observation[..., -pixels:].reshape(*observation.shape[:-1], *self.image)
+        return jnp.concatenate([observation[..., :-pixels], Compressor()(picture)], axis=-1)
+
+
+class Compressor(nn.Module):
+    """A picture of the ground to 16 numbers: mixes channels, then tiles of 4 x 4, then all tiles.
+
+    Linear maps of tiles instead of overlapping convolutions: the picture is of features that have
+    seen their neighbourhood, and this costs a sixth.
+    """
+
+    @nn.compact
+    def __call__(self, picture: jax.Array) -> jax.Array:
+        """`[..., h, w, c]` to `[..., 16]` in [-1, 1]."""
+        kernel_init = nn.initializers.orthogonal(math.sqrt(2))
+        x = nn.tanh(nn.Dense(8, kernel_init=kernel_init)(picture))
+        x = nn.tanh(nn.Conv(16, (4, 4), strides=4, padding="VALID", kernel_init=kernel_init)(x))
+        x = x.reshape(*x.shape[:-3], -1)
+        return nn.tanh(nn.Dense(16, kernel_init=kernel_init)(x))
+
+
 class Attention(nn.Module):
     """Looks at every candidate with the same weights and attends to some.
 
@@ -129,11 +170,11 @@ class Actor(nn.Module):
     actions: int
     hidden: Sequence[int]
     initial_log_std: float
-    candidates: Candidates | None = None
+    senses: Senses = Senses()
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> Gaussian:
-        features, attended, hidden = _look(observation, self.hidden, self.candidates)
+        features, attended, hidden = _look(observation, self.hidden, self.senses)
         mean = attended + MLP(hidden, self.actions, output_gain=0.01)(features)
         low, high = LOG_STD_BOUNDS
         share = (self.initial_log_std - low) / (high - low)
@@ -146,11 +187,11 @@ class Critic(nn.Module):
     """`[..., O]` observations to `[...]` values."""
 
     hidden: Sequence[int]
-    candidates: Candidates | None = None
+    senses: Senses = Senses()
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
-        features, _, hidden = _look(observation, self.hidden, self.candidates)
+        features, _, hidden = _look(observation, self.hidden, self.senses)
         return MLP(hidden, 1, output_gain=1.0)(features)[..., 0]
 
 
@@ -165,11 +206,11 @@ class SquashedActor(nn.Module):
     actions: int
     hidden: Sequence[int]
     initial_log_std: float | None
-    candidates: Candidates | None = None
+    senses: Senses = Senses()
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> Squashed:
-        features, attended, hidden = _look(observation, self.hidden, self.candidates)
+        features, attended, hidden = _look(observation, self.hidden, self.senses)
         if self.initial_log_std is None:
             mean = attended + MLP(hidden, self.actions, output_gain=0.01)(features)
             return Squashed(Gaussian(mean, jnp.full(self.actions, -jnp.inf)))
@@ -185,11 +226,11 @@ class ActionCritic(nn.Module):
     """`[..., O]` observations and `[..., A]` actions to `[...]` values."""
 
     hidden: Sequence[int]
-    candidates: Candidates | None = None
+    senses: Senses = Senses()
 
     @nn.compact
     def __call__(self, observation: jax.Array, action: jax.Array) -> jax.Array:
-        features, _, hidden = _look(observation, self.hidden, self.candidates)
+        features, _, hidden = _look(observation, self.hidden, self.senses)
         inputs = jnp.concatenate([features, action], axis=-1)
         return MLP(hidden, 1, output_gain=1.0)(inputs)[..., 0]
 
@@ -203,13 +244,14 @@ def twin_values(
 
 
 def _look(
-    observation: jax.Array, hidden: Sequence[int], candidates: Candidates | None
+    observation: jax.Array, hidden: Sequence[int], senses: Senses
 ) -> tuple[jax.Array, jax.Array | float, Sequence[int]]:
     """Features `[..., F]`, the mean of attended actions, 0 without any, and layers still to come.
 
     Part of a module's compact method.
     """
-    if candidates is None:
+    observation = senses.read(observation)
+    if senses.candidates is None:
         return observation, 0.0, hidden
-    features, attended = Attention(hidden, candidates)(observation)
+    features, attended = Attention(hidden, senses.candidates)(observation)
     return features, attended, hidden[-1:]

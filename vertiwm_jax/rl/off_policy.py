@@ -14,7 +14,7 @@ import optax
 from flax import struct
 from gymnax.environments.environment import Environment
 
-from vertiwm_jax.networks.policy import ActionCritic, Candidates, SquashedActor, twin_values
+from vertiwm_jax.networks.policy import ActionCritic, Senses, SquashedActor, twin_values
 from vertiwm_jax.rl import environments
 from vertiwm_jax.rl.environments import Environments, Experience, Metrics, Outcomes
 from vertiwm_jax.rl.learned import MeanAction, TwinValue
@@ -130,7 +130,7 @@ class Rule(Protocol[Learner]):
         """The algorithm's settings."""
         ...
 
-    def actor(self, actions: int, candidates: Candidates | None) -> SquashedActor:
+    def actor(self, actions: int, senses: Senses) -> SquashedActor:
         """The network of the policy."""
         ...
 
@@ -176,13 +176,13 @@ class OffPolicy(Generic[Learner]):
 
     env: static; its parameters are an argument of every function.
     outcomes: what to report, averaged over the episodes that end in an iteration.
-    candidates: actions that the networks weigh against each other, if the task has such.
+    senses: how the networks read observations.
     """
 
     env: Environment
     rule: Rule[Learner]
     outcomes: Outcomes = lambda info: {}
-    candidates: Candidates | None = None
+    senses: Senses = Senses()
 
     @property
     def config(self) -> OffPolicyConfig:
@@ -257,8 +257,8 @@ class OffPolicy(Generic[Learner]):
         config = self.config
         actions = math.prod(self.env.action_space(env_params).shape)
         return Networks(
-            self.rule.actor(actions, self.candidates),
-            ActionCritic(config.hidden, self.candidates),
+            self.rule.actor(actions, self.senses),
+            ActionCritic(config.hidden, self.senses),
             optax.chain(
                 optax.clip_by_global_norm(config.max_gradient_norm),
                 optax.adam(config.learning_rate),

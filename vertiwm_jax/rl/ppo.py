@@ -15,7 +15,7 @@ import optax
 from flax import struct
 from gymnax.environments.environment import Environment
 
-from vertiwm_jax.networks.policy import Actor, Candidates, Critic, Gaussian
+from vertiwm_jax.networks.policy import Actor, Critic, Gaussian, Senses
 from vertiwm_jax.rl import environments
 from vertiwm_jax.rl.advantages import generalised_advantages
 from vertiwm_jax.rl.environments import Environments, Experience, Metrics, Outcomes
@@ -121,13 +121,13 @@ class PPO:
 
     env: static; its parameters are an argument of every function.
     outcomes: what to report, averaged over the episodes that end in an iteration.
-    candidates: actions that the networks weigh against each other, if the task has such.
+    senses: how the networks read observations.
     """
 
     env: Environment
     config: PPOConfig
     outcomes: Outcomes = lambda info: {}
-    candidates: Candidates | None = None
+    senses: Senses = Senses()
 
     def init(self, env_params: Params, key: jax.Array) -> TrainState:
         """The state before the first iteration."""
@@ -201,11 +201,11 @@ class PPO:
     def _actor(self, env_params: Params) -> Actor:
         actions = math.prod(self.env.action_space(env_params).shape)
         config = self.config
-        return Actor(actions, config.hidden, config.initial_log_std, self.candidates)
+        return Actor(actions, config.hidden, config.initial_log_std, self.senses)
 
     @property
     def _critic(self) -> Critic:
-        return Critic(self.config.hidden, self.candidates)
+        return Critic(self.config.hidden, self.senses)
 
     @property
     def _optimiser(self) -> optax.GradientTransformation:

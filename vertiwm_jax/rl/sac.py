@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from vertiwm_jax.networks.policy import Candidates, Squashed, SquashedActor
+from vertiwm_jax.networks.policy import Senses, Squashed, SquashedActor
 from vertiwm_jax.rl.environments import Metrics
 from vertiwm_jax.rl.off_policy import Networks, OffPolicyConfig, Params, Remembered
 
@@ -55,9 +55,9 @@ class SAC:
 
     config: SACConfig
 
-    def actor(self, actions: int, candidates: Candidates | None) -> SquashedActor:
+    def actor(self, actions: int, senses: Senses) -> SquashedActor:
         config = self.config
-        return SquashedActor(actions, config.hidden, config.initial_log_std, candidates)
+        return SquashedActor(actions, config.hidden, config.initial_log_std, senses)
 
     def init(self, networks: Networks, observation: jax.Array, key: jax.Array) -> SACLearner:
         actor, critics = networks.init(key, observation)

@@ -16,7 +16,7 @@ from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.rl import ground
 from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.choice import ModelName, choose
+from vertiwm_jax.world_model.choice import ModelName, choose, sighted
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,10 @@ def environment(
 def dynamics(config: TaskConfig, model: ModelName) -> tuple[Dynamics, Params]:
     """One of the models, and its parameters."""
     if model == "builtin":
-        return config.simulator, chrono_like(hmmwv())
-    return choose(model, config.weights)
+        chosen = config.simulator, chrono_like(hmmwv())
+    else:
+        chosen = choose(model, config.weights)
+    return sighted(model, *chosen, config.weights) if config.navigation.embeddings else chosen
 
 
 def outcomes(info: dict[str, jax.Array]) -> dict[str, jax.Array]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from vertiwm_jax.networks.policy import Candidates, Squashed, SquashedActor
+from vertiwm_jax.networks.policy import Senses, Squashed, SquashedActor
 from vertiwm_jax.rl.environments import Metrics
 from vertiwm_jax.rl.off_policy import Networks, OffPolicyConfig, Params, Remembered
 
@@ -54,8 +54,8 @@ class TD3:
 
     config: TD3Config
 
-    def actor(self, actions: int, candidates: Candidates | None) -> SquashedActor:
-        return SquashedActor(actions, self.config.hidden, None, candidates)
+    def actor(self, actions: int, senses: Senses) -> SquashedActor:
+        return SquashedActor(actions, self.config.hidden, None, senses)
 
     def init(self, networks: Networks, observation: jax.Array, key: jax.Array) -> TD3Learner:
         actor, critics = networks.init(key, observation)

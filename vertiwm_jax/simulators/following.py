@@ -12,6 +12,7 @@ from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, Navigati
 from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model.perception import Sighted, SightedParams
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,14 @@ class Followed:
         return VehicleState.from_vector(params), ()
 
 
+def followed(env: NavigationEnv) -> NavigationEnv:
+    """The same task, with the vehicle moved from outside; it sees by the same encoders."""
+    dynamics = env.dynamics
+    if isinstance(dynamics, Sighted):
+        return replace(env, dynamics=replace(dynamics, dynamics=Followed()))
+    return replace(env, dynamics=Followed())
+
+
 def start(
     simulator: Simulator,
     env: NavigationEnv,
@@ -43,7 +52,8 @@ def start(
 
     state: a start of the pool, whose vehicle is replaced; pose: `[3]` x, y, m, and yaw, rad.
     """
-    return _begin(env, params, state, simulator.start(*pose).state)
+    seen = jnp.asarray(simulator.start(*pose).state)
+    return _begin(env, _moved(params, seen), state, seen)
 
 
 def move(
@@ -51,12 +61,21 @@ def move(
 ) -> NavigationParams:
     """Does the action `[2]` in `simulator`; `Followed` does the same with these parameters."""
     seen = simulator.step(np.asarray(env.config.command(action).vector))
-    return replace(params, dynamics=jnp.asarray(seen.state))
+    return _moved(params, jnp.asarray(seen.state))
+
+
+def _moved(params: NavigationParams, state: jax.Array) -> NavigationParams:
+    dynamics = params.dynamics
+    if isinstance(dynamics, SightedParams):
+        return replace(params, dynamics=replace(dynamics, dynamics=state))
+    return replace(params, dynamics=state)
 
 
 @partial(jax.jit, static_argnames="env")
 def _begin(
     env: NavigationEnv, params: NavigationParams, state: NavigationState, seen: jax.Array
 ) -> tuple[jax.Array, NavigationState]:
-    state = replace(state, vehicle=VehicleState.from_vector(seen), history=())
+    vehicle, terrain = VehicleState.from_vector(seen), params.terrain.select(state.world)
+    history = env.dynamics.init(params.dynamics, terrain, vehicle)
+    state = replace(state, vehicle=vehicle, history=history)
     return env.observe(None, state, None, params), state

@@ -10,6 +10,7 @@ from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.world_model import model
 from vertiwm_jax.world_model.nesam import SoilSource
+from vertiwm_jax.world_model.perception import Sighted, SightedParams
 
 ModelName = Literal["builtin", "transformer", "nesam", "vertiwm"]
 """The simulator, which has learned nothing; either specialist; both of them fused."""
@@ -31,6 +32,28 @@ def choose(
     if name not in found:
         raise CheckpointError(f"{folder}: expected {name}, found {' and '.join(found)} alone")
     return found[name]
+
+
+def sighted(
+    name: ModelName, dynamics: Dynamics, params: Params, weights: Path | None = None
+) -> tuple[Dynamics, Params]:
+    """A model of `choose` that sees by the Transformer's encoders, whatever it sees by itself.
+
+    So a policy learns and drives by the same eyes everywhere. What the model has computed already
+    is not computed again. Raises like `choose`, with "transformer".
+    """
+    folder = weights or model.PRETRAINED
+    config, found = model.load(folder)
+    if "transformer" not in config.parts or config.terrain != "patches":
+        raise CheckpointError(
+            f"{folder}: expected the encoders of a Transformer, for navigation.embeddings, "
+            f"found {' and '.join(config.parts)} with terrain {config.terrain!r}"
+        )
+    seeing = {"vertiwm", "transformer"} | ({"nesam"} if config.encoders == "shared" else set())
+    if name in seeing:
+        return dynamics, params
+    encoders = found.transformer.encoders
+    return Sighted(dynamics, config.transformer.exteroception), SightedParams(params, encoders)
 
 
 def fitted(

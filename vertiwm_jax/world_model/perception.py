@@ -79,6 +79,56 @@ class Exteroception:
         return Perception(cast(jax.Array, elevation), cast(jax.Array, semantic))
 
 
+@struct.dataclass
+class SightedParams:
+    """dynamics: of the model that moves; encoders: of what it is made to see by."""
+
+    dynamics: Params
+    encoders: EncoderParams
+
+
+@struct.dataclass
+class SightedHistory:
+    """history: of the model that moves; perception: of the current state."""
+
+    history: History
+    perception: Perception
+
+
+@dataclass(frozen=True)
+class Sighted:
+    """Any `Dynamics`, with what encoders see at each state in its history: moves as it does.
+
+    For policies that see the ground by a world model's encoders and drive in something else.
+    """
+
+    dynamics: Dynamics
+    exteroception: Exteroception = Exteroception()
+
+    def init(
+        self, params: SightedParams, terrain: TerrainMap, state: VehicleState
+    ) -> SightedHistory:
+        """The model's history, and a look at the ground."""
+        history = self.dynamics.init(params.dynamics, terrain, state)
+        return SightedHistory(history, self._look(params, terrain, state))
+
+    def step(
+        self,
+        params: SightedParams,
+        terrain: TerrainMap,
+        history: SightedHistory,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, SightedHistory]:
+        """The model's next state, and a look at the ground there."""
+        state, moved = self.dynamics.step(params.dynamics, terrain, history.history, state, command)
+        return state, SightedHistory(moved, self._look(params, terrain, state))
+
+    def _look(self, params: SightedParams, terrain: TerrainMap, state: VehicleState) -> Perception:
+        patches = self.exteroception.query(terrain, state)
+        return self.exteroception.encode(params.encoders, patches)
+
+
 class Specialist(Dynamics, Protocol):
     """A `Dynamics` whose step is a proposal, and then a look at where it leads.
 
