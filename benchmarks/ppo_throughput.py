@@ -54,7 +54,7 @@ def of_task(name: str, model: ModelName) -> Figures:
     """An iteration of the training that the configuration `name` describes, inside a model."""
     file = configuration.default_config(name)
     config = replace(configuration.load(PPOTraining, file), model=model)
-    training, _ = task.environments(config)
+    training, _ = task.training_environment(config)
     return iteration(config.algorithm(training.env), training.params, config.action_repeat)
 
 

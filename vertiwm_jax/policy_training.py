@@ -2,7 +2,8 @@
 
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol
@@ -144,10 +145,8 @@ def train_and_report(config: TrainConfig) -> Path:
     """Trains, or goes on with, a policy, tests it, and gives the folder of the run."""
     keep_compiled(config.compile_cache)
     print("drawing worlds, and placing vehicles on them ...", flush=True)
-    try:
-        training, test = task.environments(config)
-    except ValueError as error:  # what is wrong with the maps, or with the tasks on them
-        sys.exit(f"error: {error}")
+    with _on_usable_ground():
+        training, held_out = task.training_environment(config)
     env, params = training.env, training.params
     algorithm, schedule, seeds = config.algorithm(env), config.schedule, config.loop.seeds
     steps = schedule.collected * config.action_repeat
@@ -161,11 +160,22 @@ def train_and_report(config: TrainConfig) -> Path:
         )
         policies = _policies(config, algorithm, params, state) | baselines(config.navigation)
         _draw_learning(run, config)
+        with _on_usable_ground():
+            test = task.test_environment(config, held_out)
         groups = report.drive(test.env, test.params, policies, config.key("testing"))
         print(f"\n{report.markdown(groups, REFERENCE)}\n")
         ground_driven, radius = test.params.terrain, config.navigation.goal_radius
         report.write(run.folder, groups, REFERENCE, ground_driven, radius)
     return run.folder
+
+
+@contextmanager
+def _on_usable_ground() -> Iterator[None]:
+    """Ends the command where something is wrong with the maps, or with the tasks on them."""
+    try:
+        yield
+    except ValueError as error:
+        sys.exit(f"error: {error}")
 
 
 def _draw_learning(run: Run, config: TrainConfig) -> None:

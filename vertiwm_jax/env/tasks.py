@@ -18,6 +18,7 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 _SURROUNDINGS = 4.0  # m
 _SWAYS = 13  # places that a pair of the circle may turn to
+_DRAWN_TOGETHER = 16  # random tasks
 
 
 @struct.dataclass
@@ -88,7 +89,8 @@ def circle_tasks(
         return jnp.take_along_axis(turns, jnp.argmin(slopes, axis=1)[:, None], axis=1)[:, 0]
 
     world = jnp.arange(terrain.worlds, dtype=jnp.int32)
-    angle = jax.vmap(most_level)(world).ravel() if sway else jnp.tile(evenly, terrain.worlds)
+    level = jax.jit(jax.vmap(most_level))
+    angle = level(world).ravel() if sway else jnp.tile(evenly, terrain.worlds)
     start = on_circle(angle)
     return Tasks(
         world=jnp.repeat(world, pairs),
@@ -138,7 +140,8 @@ def _draw(
     corner = terrain.origin - jnp.array([0.0, 1.0]) * extent
     low, high = corner + config.margin, corner + extent - config.margin
 
-    def draw(key: jax.Array, world: jax.Array) -> tuple[Tasks, jax.Array]:
+    def draw(inputs: tuple[jax.Array, jax.Array]) -> tuple[Tasks, jax.Array]:
+        key, world = inputs
         selected = terrain.select(world)
         shape = (config.candidates, 2)
         key_start, key_goal, key_yaw = jax.random.split(key, 3)
@@ -149,29 +152,27 @@ def _draw(
             key_yaw, shape[:1], minval=-config.heading_error, maxval=config.heading_error
         )
         distance = jnp.linalg.norm(offset, axis=-1)
-        rpy = jax.vmap(lambda xy, yaw: place(selected, chassis, xy, yaw).rpy)(start, yaw)
-        tilt = jnp.arccos(jnp.cos(rpy[:, 0]) * jnp.cos(rpy[:, 1]))
+        near_enough = (distance >= config.distance[0]) & (distance <= config.distance[1])
         length = chassis.length + 2 * config.clearance
         width = chassis.width + 2 * config.clearance
 
-        def blocked(xy: jax.Array) -> jax.Array:
-            return jax.vmap(lambda xy, yaw: obstacles.collides(selected, xy, yaw, length, width))(
-                xy, yaw
-            )
+        def is_acceptable(i: jax.Array) -> jax.Array:
+            roll, pitch, _ = place(selected, chassis, start[i], yaw[i]).rpy
+            tilt = jnp.arccos(jnp.cos(roll) * jnp.cos(pitch))
+            level = slope_around(selected, start[i]) <= config.roughest_start
+            ends = jnp.stack([start[i], goal[i]])
+            blocked = obstacles.collides(selected, ends, yaw[i][None], length, width)
+            return near_enough[i] & (tilt <= config.steepest_start) & level & ~jnp.any(blocked)
 
-        acceptable = (
-            (distance >= config.distance[0])
-            & (distance <= config.distance[1])
-            & (tilt <= config.steepest_start)
-            & (slope_around(selected, start) <= config.roughest_start)
-            & ~blocked(start)
-            & ~blocked(goal)
+        first = jax.lax.while_loop(
+            lambda i: (i < config.candidates) & ~is_acceptable(i), lambda i: i + 1, jnp.int32(0)
         )
-        first = jnp.argmax(acceptable)
-        return Tasks(world, start[first], yaw[first], goal[first]), acceptable[first]
+        found = first < config.candidates
+        return Tasks(world, start[first], yaw[first], goal[first]), found
 
     world = jnp.arange(count, dtype=jnp.int32) % terrain.worlds
-    return jax.vmap(draw)(jax.random.split(key, count), world)
+    # In small batches, since each goes on until the last task of it is found.
+    return jax.lax.map(draw, (jax.random.split(key, count), world), batch_size=_DRAWN_TOGETHER)
 
 
 def place(terrain: TerrainMap, chassis: Chassis, xy: jax.Array, yaw: jax.Array) -> VehicleState:

@@ -7,6 +7,7 @@ from typing import Literal
 import jax
 
 from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.env import tasks
 from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv, NavigationParams
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
@@ -54,21 +55,23 @@ class Task:
     params: NavigationParams
 
 
-def environments(config: TaskConfig) -> tuple[Task, Task]:
-    """What to train in, and what to test in.
+def training_environment(config: TaskConfig) -> tuple[Task, TerrainMap]:
+    """What to train in, and the worlds held out for `test_environment`.
 
     Maps that cannot be used, and tasks that cannot be driven on them, raise `ValueError`; weights
     that cannot be read, `CheckpointError`.
     """
+    navigation = config.navigation
     terrain, held_out = ground.grounds(config.ground, config.worlds, config.key("worlds"))
-    chassis = config.navigation.chassis
-    tasks = ground.training_tasks(config.ground, terrain, chassis, config.key("tasks"))
-    training = environment(config, config.model, terrain, tasks, config.variation)
-    return training, test_environment(config, held_out)
+    # Now, and not when the training is over.
+    tests = ground.test_tasks(config.ground, held_out)
+    tasks.validate(tests, held_out, navigation.goal_radius, navigation.map_margin)
+    pool = ground.training_tasks(config.ground, terrain, navigation.chassis, config.key("tasks"))
+    return environment(config, config.model, terrain, pool, config.variation), held_out
 
 
 def held_out(config: TaskConfig) -> TerrainMap:
-    """The worlds that `environments` tests on."""
+    """The worlds that `training_environment` holds out."""
     key = config.key("worlds")
     if config.worlds is None:
         return ground.suite_worlds(config.ground, key)
@@ -84,13 +87,13 @@ def environment(
     config: TaskConfig,
     model: ModelName,
     terrain: TerrainMap,
-    tasks: Tasks,
+    pool: Tasks,
     variation: VariationConfig = VariationConfig(),
 ) -> Task:
     """Tasks inside one of the models."""
     moves, params = dynamics(config, model)
     env = NavigationEnv(moves, config.navigation, variation)
-    return Task(env, env.make_params(params, terrain, tasks))
+    return Task(env, env.make_params(params, terrain, pool))
 
 
 def dynamics(config: TaskConfig, model: ModelName) -> tuple[Dynamics, Params]:

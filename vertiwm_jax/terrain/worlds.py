@@ -6,7 +6,6 @@ difficulty with the median slope of its low, mid and high worlds, and one beyond
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import cycle, islice, product
 from typing import Literal, get_args
 
@@ -114,16 +113,16 @@ def generate(keys: jax.Array, config: WorldConfig) -> TerrainMap:
     drawn = labels(config, len(keys))
     slope = [d if isinstance(d, float | int) else MEDIAN_SLOPE_DEG[d] for d, _ in drawn]
     kind = [_KINDS.index(k) for _, k in drawn]
-    worlds = _worlds(
-        keys,
-        jnp.array(slope, jnp.float32),
-        jnp.array(kind, jnp.int32),
-        config.relief,
-        config.rocks,
-        config.trees,
-        config.obstructed,
-    )
-    elevation, semantic, friction, obstacles = worlds
+    # One after the other: `vmap` would be no faster, compile twice as long, and take W times the
+    # memory for the transforms; and so every number of worlds runs the same program.
+    parts = [
+        (
+            *_ground(keys[i], np.float32(slope[i]), np.int32(kind[i]), config.relief),
+            _obstacles(keys[i], config.rocks, config.trees, config.obstructed),
+        )
+        for i in range(len(keys))
+    ]
+    elevation, semantic, friction, obstacles = map(jnp.stack, zip(*parts, strict=True))
     return TerrainMap(
         elevation=elevation,
         semantic=semantic,
@@ -140,30 +139,14 @@ def generate(keys: jax.Array, config: WorldConfig) -> TerrainMap:
     )
 
 
-@partial(jax.jit, static_argnames=("relief", "rocks", "trees", "obstructed"))
-def _worlds(
-    keys: jax.Array,
-    slope_deg: jax.Array,
-    kind: jax.Array,
-    relief: ReliefConfig,
-    rocks: int,
-    trees: int,
-    obstructed: float,
-) -> tuple[jax.Array, ...]:
-    def world(inputs: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        key, slope_deg, kind = inputs
-        relief_key, class_key, friction_key, obstacle_key = jax.random.split(key, 4)
-        semantic = _classes(class_key, kind)
-        return (
-            _relief(relief_key, slope_deg, relief),
-            semantic,
-            _friction(friction_key, semantic),
-            _obstacles(obstacle_key, rocks, trees, obstructed),
-        )
-
-    # One after the other: `vmap` would be no faster, compile twice as long, and take W times the
-    # memory for the transforms.
-    return jax.lax.map(world, (keys, slope_deg, kind))
+@jax.jit(static_argnames="relief")
+def _ground(
+    key: jax.Array, slope_deg: jax.Array, kind: jax.Array, relief: ReliefConfig
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Elevation, semantic classes and friction of one world."""
+    relief_key, class_key, friction_key, _ = jax.random.split(key, 4)
+    semantic = _classes(class_key, kind)
+    return _relief(relief_key, slope_deg, relief), semantic, _friction(friction_key, semantic)
 
 
 def _relief(key: jax.Array, slope_deg: jax.Array, config: ReliefConfig) -> jax.Array:
@@ -278,11 +261,13 @@ def _friction(key: jax.Array, semantic: jax.Array) -> jax.Array:
     return jnp.where(semantic < FIRST_DEFORMABLE, jnp.clip(drawn, *FRICTION_LIMITS), 0.0)
 
 
+@jax.jit(static_argnames=("rocks", "trees"))
 def _obstacles(key: jax.Array, rocks: int, trees: int, obstructed: float) -> jax.Array:
     """`[rocks + trees, 5]` boxes anywhere on the map but near the circle of starts and goals.
 
     Zeros, which are no obstacles, in all but a share `obstructed` of worlds.
     """
+    *_, key = jax.random.split(key, 4)
     drawn = jax.random.uniform(key, (rocks + trees, 4))
     scale = 0.7 + 0.5 * drawn[:rocks, :1]
     sizes = jnp.concatenate(
