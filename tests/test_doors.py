@@ -200,7 +200,8 @@ def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch
     navigate = ["navigation", "--policy"]
     maps(tmp_path / "maps", count=2)
     evaluate.main([*navigate, str(run), "--worlds", str(tmp_path / "maps")])
-    assert "driving 4 tasks on 2 worlds" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "driving 4 tasks on 2 worlds" in said and "  straight to goal: " in said
     # The usual worlds are many.
     monkeypatch.setattr(configuration, "default_config", lambda name: run / "config.yaml")
     evaluate.main([*navigate, "straight", "--suites", "hard", "--seed", "7"])

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,12 @@ def drive(
 ) -> dict[str, Results]:
     """Drives all tasks of the pool with each policy; the results by suite."""
     print(f"driving {params.pool_size} tasks on {params.terrain.worlds} worlds ...", flush=True)
-    results = {name: judge(env, params, policy, key) for name, policy in policies.items()}
+    results = {}
+    for name, policy in policies.items():
+        start = time.perf_counter()
+        results[name] = judge(env, params, policy, key)
+        solved, seconds = int(np.sum(results[name].success)), time.perf_counter() - start
+        print(f"  {name}: {solved} solved, compiled and driven in {seconds:.0f} s", flush=True)
     return by_suite(results, ground.suites(params.terrain))
 
 
