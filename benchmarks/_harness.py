@@ -77,13 +77,14 @@ def report(name: str, results: Mapping[str, Figures], as_json: bool) -> None:
     for column in columns:
         table.add_column(column, justify="right")
     for case, figures in results.items():
-        table.add_row(case, *(_cell(figures.get(column, "")) for column in columns))
+        table.add_row(case, *(cell(figures.get(column, "")) for column in columns))
     console = Console()
     console.print(table)
     console.print(" | ".join(f"{key} {value}" for key, value in machine.items()), highlight=False)
 
 
-def _cell(value: float | int | str) -> str:
+def cell(value: float | int | str) -> str:
+    """A figure as tables show it."""
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
     return f"{value:,}" if isinstance(value, int) else value

@@ -13,6 +13,7 @@ from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import worlds
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.worlds import WorldConfig
 from vertiwm_jax.world_model.choice import ModelName, choose
 
@@ -20,31 +21,39 @@ BATCHES = (1, 20, 256, 1024)
 STEPS = 20
 
 
-def rates(name: ModelName, weights: Path | None, batches: Sequence[int]) -> dict[str, Figures]:
-    """Steps a second of one model, by batch."""
-    model, params = choose(name, weights)
+def drives(batch: int, steps: int) -> tuple[TerrainMap, VehicleState, Command]:
+    """A mixed world, vehicles at rest on it, leaves `[B, 3]`, and commands, leaves `[B, T]`."""
     terrain = worlds.generate(jax.random.split(jax.random.key(0), 1), WorldConfig())
-    vehicle = hmmwv()
+    vehicle, keys = hmmwv(), jax.random.split(jax.random.key(1), 4)
 
-    def drive(params: Params, xy: jax.Array, yaw: jax.Array, commands: Command) -> jax.Array:
+    def place(xy: jax.Array, yaw: jax.Array) -> VehicleState:
         position, rpy = rest_on_ground(
             terrain, xy, yaw, vehicle.wheelbase, vehicle.track, vehicle.wheel_radius
         )
-        state = VehicleState(position, rpy, jnp.zeros(3), jnp.zeros(3))
-        history = model.init(params, terrain, state)
-        return rollout(model, params, terrain, history, state, commands).position[-1]
+        return VehicleState(position, rpy, jnp.zeros(3), jnp.zeros(3))
+
+    commands = Command(
+        speed=jax.random.uniform(keys[0], (batch, steps), maxval=4.0),
+        steering=jax.random.uniform(keys[1], (batch, steps), minval=-0.3, maxval=0.3),
+    )
+    xy = jax.random.uniform(keys[2], (batch, 2), minval=-40.0, maxval=40.0)
+    yaw = jax.random.uniform(keys[3], (batch,), minval=-jnp.pi, maxval=jnp.pi)
+    return terrain, jax.jit(jax.vmap(place))(xy, yaw), commands
+
+
+def rates(name: ModelName, weights: Path | None, batches: Sequence[int]) -> dict[str, Figures]:
+    """Steps a second of one model, by batch."""
+    model, params = choose(name, weights)
+
+    def drive(params: Params, start: VehicleState, commands: Command) -> jax.Array:
+        history = model.init(params, terrain, start)
+        return rollout(model, params, terrain, history, start, commands).position[-1]
 
     results = {}
     for batch in batches:
-        keys = jax.random.split(jax.random.key(1), 4)
-        commands = Command(
-            speed=jax.random.uniform(keys[0], (batch, STEPS), maxval=4.0),
-            steering=jax.random.uniform(keys[1], (batch, STEPS), minval=-0.3, maxval=0.3),
-        )
-        xy = jax.random.uniform(keys[2], (batch, 2), minval=-40.0, maxval=40.0)
-        yaw = jax.random.uniform(keys[3], (batch,), minval=-jnp.pi, maxval=jnp.pi)
-        many = jax.jit(jax.vmap(drive, in_axes=(None, 0, 0, 0)))
-        figures = measure(many, params, xy, yaw, commands, repeats=3)
+        terrain, starts, commands = drives(batch, STEPS)
+        many = jax.jit(jax.vmap(drive, in_axes=(None, 0, 0)))
+        figures = measure(many, params, starts, commands, repeats=3)
         rate = batch * STEPS / figures["median_s"]
         results[f"{name}, batch {batch}"] = {"steps_per_s": rate, **figures}
     return results

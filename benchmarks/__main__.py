@@ -1,0 +1,50 @@
+"""Runs every benchmark and writes one page: `python -m benchmarks [--output PAGE]`."""
+
+import argparse
+import json
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import benchmarks
+from benchmarks._harness import cell
+
+_APART = {"recurrent_baseline"}
+"""Those that need a folder of drives, and train."""
+
+
+def page(found: dict[str, Any]) -> str:
+    """Markdown: the hardware, then a table for each benchmark."""
+    machine = next(iter(found.values()))["hardware"]
+    sections = ["# Benchmarks", ", ".join(f"{key} {value}" for key, value in machine.items())]
+    for name, one in found.items():
+        results = one["results"]
+        columns = list(dict.fromkeys(key for figures in results.values() for key in figures))
+        rows = [["case", *columns], ["---"] * (1 + len(columns))]
+        for case, figures in results.items():
+            rows.append([case, *(cell(figures.get(column, "")) for column in columns)])
+        table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        sections += [f"## {name}", table]
+    return "\n\n".join(sections) + "\n"
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    arguments.add_argument("--output", type=Path, default=Path("benchmarks.md"))
+    chosen = arguments.parse_args()
+    names = [module.name for module in pkgutil.iter_modules(benchmarks.__path__)]
+    found = {}
+    for name in names:
+        if not name.startswith("_") and name not in _APART:
+            print(f"{name} ...", flush=True)
+            command = [sys.executable, "-m", f"benchmarks.{name}", "--json"]
+            done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+            found[name] = json.loads(done.stdout.splitlines()[-1])
+            chosen.output.write_text(page(found), encoding="utf-8")
+    print(f"written to {chosen.output}")
+
+
+if __name__ == "__main__":
+    main()
