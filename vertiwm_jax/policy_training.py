@@ -103,9 +103,10 @@ def learned(config: TrainConfig, terrain: TerrainMap, run: Path) -> Rows:
 
     terrain: any worlds that tests can be drawn on.
     """
-    tasks = ground.test_tasks(config.ground, terrain)
-    made = task.environment(config, config.model, terrain, tasks, config.variation)
-    algorithm, params = config.algorithm(made.env), made.params
+    dynamics, weights = task.dynamics(config, config.model)
+    env = NavigationEnv(dynamics, config.navigation, config.variation)
+    params = env.shapes(weights, terrain, ground.test_tasks(config.ground, terrain))
+    algorithm = config.algorithm(env)
     restored = restore(algorithm, params, run, config.loop.seeds)
     if restored is None:
         raise CheckpointError(f"{run}: expected checkpoints of a training, found none")

@@ -142,6 +142,14 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         """
         return _make_params(self, dynamics, terrain, tasks)
 
+    def shapes(self, dynamics: Params, terrain: TerrainMap, tasks: Tasks) -> NavigationParams:
+        """What `make_params` gives, but for the starts, of which only shapes are known.
+
+        Enough to restore what was learned with such parameters, without settling anything.
+        """
+        starts, seen = jax.eval_shape(partial(_settle, self), dynamics, terrain, tasks)
+        return _params(self, dynamics, terrain, starts, seen)
+
     def start(
         self, params: NavigationParams, index: jax.Array
     ) -> tuple[jax.Array, NavigationState]:
@@ -314,8 +322,18 @@ def _make_params(
             f"{int(pool.world[i])}, start {np.asarray(pool.start)[i].tolist()}); "
             f"{np.sum(~finite)} of {finite.size} tasks are so"
         )
+    return _params(env, dynamics, terrain, starts, start_observation)
+
+
+def _params(
+    env: NavigationEnv,
+    dynamics: Params,
+    terrain: TerrainMap,
+    starts: NavigationState,
+    start_observation: jax.Array,
+) -> NavigationParams:
     return NavigationParams(
-        max_steps_in_episode=jnp.int32(round(config.horizon_seconds / STEP_SECONDS)),
+        max_steps_in_episode=jnp.int32(round(env.config.horizon_seconds / STEP_SECONDS)),
         dynamics=dynamics,
         terrain=terrain,
         starts=starts,
