@@ -210,6 +210,9 @@ def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch
     assert "random" not in text and "Solved of" not in text
     evaluate.main([*navigate, "random"])
     assert "| random" in capsys.readouterr().out
+    small = ["--mppi.candidates", "2", "--mppi.decisions", "1", "--mppi.model", "builtin"]
+    evaluate.main([*navigate, "mppi", "--suites", "easy", *small])
+    assert "| mppi" in capsys.readouterr().out
 
 
 def test_training_inside_a_world_model_and_judged_in_the_simulator(train, tmp_path, capsys):

@@ -14,6 +14,7 @@ from vertiwm_jax import policy_training
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.evaluation import navigation, outside, prediction, prediction_report, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
 from vertiwm_jax.evaluation.prediction import TestWindows
@@ -25,6 +26,7 @@ from vertiwm_jax.policy_training import TrainConfig
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.ground import Suite
+from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
 from vertiwm_jax.runs import RunError
 from vertiwm_jax.sac import SACTraining
 from vertiwm_jax.simulators import chrono
@@ -79,8 +81,10 @@ class Navigation:
     The worlds and tasks are those held out of the policy's training, unless others are asked for.
     """
 
-    policy: Literal["straight", "random"] | Path
-    """Folder of a training run, or a controller that has learned nothing."""
+    policy: Literal["straight", "random", "mppi"] | Path
+    """Folder of a training run, or a controller that has learned nothing; mppi plans in a model."""
+    mppi: MPPIConfig = MPPIConfig()
+    """How it plans, and in which model, whatever moves the vehicle."""
     simulator: ModelName | Literal["chrono"] = "builtin"
     """What moves the vehicle; Chrono needs PyChrono, and drives one task after the other."""
     worlds: Path | None = None
@@ -168,6 +172,10 @@ def _navigate(command: Navigation) -> None:
     policies = baselines(config.navigation)
     if run:
         policies = policy_training.learned(config, terrain, run) | policies
+    elif command.policy == "mppi":
+        dynamics, weights = task.dynamics(config, command.mppi.model)
+        env = NavigationEnv(dynamics, config.navigation)
+        policies = {"mppi": MPPI(env=env, dynamics=weights, config=command.mppi)} | policies
     elif command.policy == "straight":
         policies = {REFERENCE: policies[REFERENCE]}
     judge = navigation.evaluate

@@ -1,0 +1,142 @@
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from env.worlds import BICYCLE, bicycle_env, ground, task
+
+from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
+from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.evaluation import navigation
+from vertiwm_jax.evaluation.controllers import StraightToGoal
+from vertiwm_jax.mechanics.kinematic import KinematicBicycle
+from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
+
+CONFIG = NavigationConfig(horizon_seconds=15.0)
+KEY = jax.random.key(0)
+SMALL = {"candidates": 16, "decisions": 4}
+
+
+@dataclass(frozen=True)
+class Pulling(KinematicBicycle):
+    """A bicycle that steers to the left by itself, a little more after every step."""
+
+    def init(self, params, terrain, state):
+        return jnp.int32(0)
+
+    def step(self, params, terrain, history, state, command):
+        pulled = replace(command, steering=command.steering + 0.002 * history)
+        state, _ = super().step(params, terrain, None, state, pulled)
+        return state, history + 1
+
+
+@pytest.fixture(scope="module")
+def blocked():
+    """A goal straight ahead, behind a wall 3 m wide; and the same the other way."""
+    terrain = ground(obstacles=[[0.0, 0.0, 2.0, 3.0, 2.0]])
+    there, back = task((-20.0, 0.0), (20.0, 0.0)), task((20.0, 0.0), (-20.0, 0.0), jnp.pi)
+    both = jax.tree.map(lambda *x: jnp.concatenate(x), there, back)
+    return bicycle_env(terrain, both, CONFIG)
+
+
+def driver(env, **config):
+    return MPPI(env=env, dynamics=BICYCLE, config=MPPIConfig(**SMALL | config))
+
+
+def decided(env, params, driver, start=0, corrections=None):
+    """What is intended at a start, once decided with `KEY`, `[D, 2]`."""
+    observation, state = env.start(params, jnp.int32(start))
+    memory = driver.start(params, state)
+    if corrections is not None:
+        memory = replace(memory, corrections=corrections)
+    return jax.jit(driver.decide)(params, memory, observation, state, KEY).corrections
+
+
+def test_it_drives_around_what_driving_straight_runs_into(blocked):
+    env, params = blocked
+    straight = navigation.evaluate(env, params, StraightToGoal(CONFIG), KEY)
+    assert (straight.ending == Ending.COLLIDED).all()
+    found = navigation.evaluate(env, params, driver(env), KEY)
+    assert (found.ending == Ending.GOAL).all()
+
+
+def test_the_model_follows_the_vehicle():
+    """Whoever steers against the pull has to know how strong it has become."""
+    env = NavigationEnv(Pulling(), replace(CONFIG, settle_steps=0))
+    params = env.make_params(BICYCLE, ground(), task((-20.0, 0.0), (20.0, 0.0)))
+    pulled = driver(env)
+    assert navigation.evaluate(env, params, pulled, KEY).ending[0] == Ending.GOAL
+    observation, state = env.start(params, jnp.int32(0))
+    memory = pulled.start(params, state)
+    act, step = jax.jit(pulled.act), jax.jit(env.step_env)
+    for _ in range(5):
+        action, memory = act(params, memory, observation, state, KEY)
+        observation, state, *_ = step(KEY, state, action, params)
+    assert int(memory.history) == int(state.history) == 5
+
+
+def test_a_plan_without_alternatives_is_kept_and_moves_on(blocked):
+    env, params = blocked
+    plan = jnp.array([[0.1, 0.2], [0.3, -0.4], [0.5, 0.6], [-0.7, 0.8]])
+    found = decided(env, params, driver(env, candidates=1), corrections=plan)
+    np.testing.assert_allclose(found, plan[jnp.array([1, 2, 3, 3])], rtol=1e-6)
+
+
+@pytest.mark.parametrize("temperature", [1e-3, 100.0, 1e9])
+def test_plans_count_by_what_they_return(blocked, temperature):
+    env, params = blocked
+    planner = driver(env, temperature=temperature)
+    observation, state = env.start(params, jnp.int32(0))
+    noise_key, key = jax.random.split(KEY)
+    noise = jax.random.normal(noise_key, (16, 4, 2)).at[0].set(0.0)
+    plans = jnp.clip(0.5 * noise, -1.0, 1.0)
+    imagine = jax.jit(jax.vmap(planner._imagine, (None, None, None, 0, None)))
+    returns = np.asarray(imagine(params, observation, state, plans, key), float)
+    weights = np.exp((returns - returns.max()) / temperature)
+    expected = np.tensordot(weights / weights.sum(), plans, axes=1)
+    if temperature < 1:
+        np.testing.assert_allclose(expected, plans[returns.argmax()], atol=1e-6)
+    if temperature > 1e6:
+        np.testing.assert_allclose(expected, np.mean(plans, axis=0), atol=1e-5)
+    np.testing.assert_allclose(decided(env, params, planner), expected, atol=1e-3)
+
+
+def test_after_a_plan_it_goes_on_to_the_goal_at_a_steady_pace(blocked):
+    env, params = blocked
+    planner = driver(env, pace=5.0, discount=0.9)
+    _, state = env.start(params, jnp.int32(0))
+    apart = jnp.linalg.norm(state.goal - state.vehicle.position)
+    toward = (state.goal - state.vehicle.position) / apart
+    near = state.goal - (8.0 + 3 * 4.0) * toward  # three decisions of 4 m from the goal's edge
+    state = replace(state, vehicle=replace(state.vehicle, position=near))
+    expected = (1 + 0.9 + 0.81) * 50.0 * 4.0 + 0.729 * 3000.0
+    assert float(planner._expected(state)) == pytest.approx(expected, rel=1e-3)
+
+
+def test_many_decide_as_each_alone(blocked):
+    env, params = blocked
+    planner = driver(env)
+    observations, states = jax.vmap(env.start, (None, 0))(params, jnp.arange(2))
+    memories = jax.vmap(planner.start, (None, 0))(params, states)
+    decide = jax.jit(jax.vmap(planner.decide, (None, 0, 0, 0, None)))
+    together = decide(params, memories, observations, states, KEY).corrections
+    for i in range(2):
+        np.testing.assert_allclose(together[i], decided(env, params, planner, i), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "expected"),
+    [
+        ("candidates", 0, "at least 1"),
+        ("decisions", 0, "at least 1"),
+        ("interval", 0, "at least 1"),
+        ("spread", -0.1, "at least 0"),
+        ("temperature", 0.0, "more than 0"),
+        ("pace", 0.0, "more than 0"),
+        ("discount", 1.0, "between 0 and 1"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(field, value, expected):
+    with pytest.raises(ValueError, match=f"{field}: expected {expected}, found {value}"):
+        MPPIConfig(**{field: value})

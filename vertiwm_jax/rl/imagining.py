@@ -1,0 +1,103 @@
+"""What drivers that look ahead share: a model that they imagine in, and what is imagined there."""
+
+from dataclasses import replace
+from typing import Self
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from vertiwm_jax.dynamics import History, Params
+from vertiwm_jax.env.driver import Driver
+from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
+from vertiwm_jax.env.repeat import ActionRepeat, corrected
+
+
+@struct.dataclass
+class Plan:
+    """What a driver that looks ahead carries.
+
+    history: of the model that it imagines in, along the way really driven.
+    corrections: `[D, 2]` of the base, of which the first is held until the next decision; the
+        actions themselves without a base.
+    """
+
+    history: History
+    corrections: jax.Array
+
+
+@struct.dataclass
+class Future:
+    """An episode as imagined so far.
+
+    observation, state: where it has led to.
+    weight: `[]` of what comes next; 0 once it is over. total: `[]` discounted rewards.
+    """
+
+    observation: jax.Array
+    state: NavigationState
+    weight: jax.Array
+    total: jax.Array
+
+    @classmethod
+    def of(cls, observation: jax.Array, state: NavigationState) -> Self:
+        """Nothing is imagined yet."""
+        return cls(observation, state, jnp.float32(1), jnp.float32(0))
+
+
+@struct.dataclass
+class Imagining(Driver):
+    """Knows a model to imagine in, which needs not be the one that the vehicle really follows.
+
+    Every decision is held for `interval` steps. Static like it: `discount`, for each decision;
+    `planned`, how many of them a plan keeps; and `base`, a controller that acts at every step, and
+    that decisions correct.
+
+    env: the task inside the model, static; dynamics: the model's parameters.
+    """
+
+    discount = 1.0
+    planned = 1
+    base = None
+
+    env: NavigationEnv = struct.field(pytree_node=False)
+    dynamics: Params
+
+    def start(self, params: NavigationParams, state: NavigationState) -> Plan:
+        """The model's first history, and no correction."""
+        terrain = params.terrain.select(state.world)
+        history = self.env.dynamics.init(self.dynamics, terrain, state.vehicle)
+        return Plan(history, jnp.zeros((self.planned, 2)))
+
+    def act(
+        self,
+        params: NavigationParams,
+        memory: Plan,
+        observation: jax.Array,
+        state: NavigationState,
+        key: jax.Array,
+    ) -> tuple[jax.Array, Plan]:
+        """The base, corrected as planned; the model's history follows the vehicle."""
+        action = corrected(self.base, observation, key, memory.corrections[0])
+        terrain, command = params.terrain.select(state.world), self.env.config.command(action)
+        _, history = self.env.dynamics.step(
+            self.dynamics, terrain, memory.history, state.vehicle, command
+        )
+        return action, replace(memory, history=history)
+
+    def imagined(
+        self, params: NavigationParams, memory: Plan, state: NavigationState
+    ) -> tuple[NavigationParams, NavigationState]:
+        """The task as it is now, inside the model."""
+        return replace(params, dynamics=self.dynamics), replace(state, history=memory.history)
+
+    def hold(
+        self, params: NavigationParams, future: Future, correction: jax.Array, key: jax.Array
+    ) -> Future:
+        """What one more decision `[2]` leads to, in the task inside the model."""
+        env = ActionRepeat(self.env, self.interval, self.base)
+        observation, state, reward, ended, _ = env.step_env(key, future.state, correction, params)
+        total = future.total + future.weight * reward
+        ended = ended | env.is_truncated(state, params)
+        weight = jnp.where(ended, 0.0, future.weight * self.discount)
+        return Future(observation, state, weight, total)
