@@ -25,7 +25,7 @@ class MPPIConfig:
     """Steps of 0.1 s that a decision is held."""
     spread: float = 0.5
     """Standard deviation of the other plans about it, in units of half the action range."""
-    temperature: float = 3.0
+    temperature: float = 30.0
     """Reward by which a plan must be worse to count e times less."""
     discount: float = 0.98
     """Of rewards, for each decision."""
