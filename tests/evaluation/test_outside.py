@@ -32,7 +32,7 @@ def test_the_built_in_simulator_outside_jit_is_that_inside():
     moves = sighted("builtin", Simulator(), chrono_like(hmmwv()))
     env = NavigationEnv(moves[0], config)
     params = env.make_params(moves[1], terrain, tasks)
-    arguments = env, params, jax.tree_util.Partial(drawn_to_soil), jax.random.key(0)
+    arguments = env, params, jax.tree_util.Partial(led_by_embedding), jax.random.key(0)
     inside, found = navigation.evaluate(*arguments), outside.evaluate(BuiltIn, tasks, *arguments)
     assert found.ending.tolist() == [Ending.GOAL, Ending.COLLIDED, Ending.TIMED_OUT]
     for name in ("ending", "steps", "world"):
@@ -42,6 +42,6 @@ def test_the_built_in_simulator_outside_jit_is_that_inside():
         np.testing.assert_allclose(ours, theirs, atol=1e-2, err_msg=name)
 
 
-def drawn_to_soil(observation, key):
-    """Straight on, but for what the last of the embedded features says."""
+def led_by_embedding(observation, key):
+    """Straight on, but for what the embedding of the ground is on average."""
     return jnp.array([1.0, 0.01 * jnp.mean(observation[OBSERVATION_SIZE:])])
