@@ -6,13 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from env.worlds import BICYCLE, SNOW, hills, task
+from env.worlds import BICYCLE, SNOW, Scripted, hills, task
 
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_LIMIT, OBSERVATION_SIZE
+from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
+from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.world_model import model
 from vertiwm_jax.world_model.choice import choose, sighted
@@ -58,6 +60,13 @@ def test_seeing_does_not_change_how_a_model_moves(terrain):
     _, blind, alone = stepped(BLIND, *moves, terrain)
     np.testing.assert_allclose(state.vehicle.vector, alone.vehicle.vector, atol=1e-6)
     np.testing.assert_allclose(seen[:OBSERVATION_SIZE], blind, atol=1e-5)
+
+
+def test_what_is_seen_where_a_model_diverged_is_finite(terrain):
+    script = VehicleState(jnp.full((1, 3), jnp.nan), *(jnp.zeros((1, 3)),) * 3)
+    moves = sighted("builtin", Scripted(CONFIG.settle_steps), script)
+    _, seen, state = stepped(CONFIG, *moves, terrain)
+    assert state.ending == Ending.DIVERGED and bool(jnp.all(jnp.isfinite(seen)))
 
 
 def test_a_model_without_eyes_is_refused(terrain):

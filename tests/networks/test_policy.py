@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from vertiwm_jax.networks import policy
 from vertiwm_jax.networks.policy import (
     LOG_STD_BOUNDS,
     ActionCritic,
@@ -121,6 +122,15 @@ def test_the_action_of_the_candidate_attended_to_is_taken():
     seen = jnp.array([[-1.0, 0, 1, 0, -1, 0], [-1, 0, -1, 0, 1, 0]])
     mean = actor.apply(params, jnp.concatenate([seen, jnp.zeros((2, 4))], -1)).mean
     np.testing.assert_allclose(mean, [[0.5, 0.0], [0.0, 1.0]], atol=1e-4)
+
+
+def test_the_largest_of_equals_has_one_derivative_and_no_division():
+    x = jnp.array([[1.0, 5.0, -2.0], [3.0, 5.0, -3.0], [2.0, 4.0, -2.5]])
+    np.testing.assert_array_equal(policy._largest(x), [3.0, 5.0, -2.0])
+    slope = jax.grad(lambda x: jnp.sum(policy._largest(x) * jnp.array([1.0, 2.0, 3.0])))
+    np.testing.assert_array_equal(slope(x), [[0, 2, 3], [1, 0, 0], [0, 0, 0]])
+    # Where a maximum is computed again with other rounding, counting what equals it counts none.
+    assert "div" not in str(jax.make_jaxpr(slope)(x))
 
 
 def test_the_picture_that_an_observation_ends_with_is_compressed():

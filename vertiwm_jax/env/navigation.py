@@ -292,8 +292,9 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         seen = observation.observe(terrain, chassis, state.vehicle, state.goal, state.action)
         if not self.config.embeddings:
             return seen
-        embedded = jnp.clip(embedding(state.history).ravel(), -limit, limit)
-        return jnp.concatenate([seen, embedded])
+        # The history goes on where the model diverged, and what it sees there may be anything.
+        embedded = jnp.nan_to_num(embedding(state.history).ravel())
+        return jnp.concatenate([seen, jnp.clip(embedded, -limit, limit)])
 
     def _is_plausible(
         self, terrain: TerrainMap, vehicle: VehicleState, apart: jax.Array

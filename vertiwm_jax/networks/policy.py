@@ -155,7 +155,7 @@ class Attention(nn.Module):
             x = nn.tanh(nn.Dense(width, kernel_init=kernel_init)(x))
         score = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))(x)
         share = nn.softmax(score, axis=-2)
-        features = [jnp.sum(share * x, axis=-2), jnp.max(x, axis=-2), rest]
+        features = [jnp.sum(share * x, axis=-2), _largest(x), rest]
         action = jnp.sum(share * jnp.asarray(self.candidates.actions), axis=-2)
         return jnp.concatenate(features, axis=-1), action
 
@@ -242,6 +242,16 @@ def twin_values(
     """`[2, ...]` values of actions, by two critics whose weights have an axis for them."""
     values = jax.vmap(critic.apply, (0, None, None))(params, observation, action)
     return cast(jax.Array, values)
+
+
+def _largest(x: jax.Array) -> jax.Array:
+    """`[..., C, F]` to `[..., F]`, the largest of the C.
+
+    The derivative of `jnp.max` looks for what equals the maximum. Compilers may compute x once more
+    for it, with other rounding; then nothing does, and it is NaN.
+    """
+    chosen = jnp.argmax(x, axis=-2, keepdims=True) == jnp.arange(x.shape[-2])[:, None]
+    return jnp.sum(jnp.where(chosen, x, 0.0), axis=-2)
 
 
 def _look(

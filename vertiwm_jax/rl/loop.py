@@ -1,6 +1,7 @@
 """Training of an RL algorithm: the host loop around several seeds at once."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -35,7 +36,9 @@ class _Seeds(Generic[State]):
 
     def init(self, env_params: Any, key: jax.Array) -> State:
         keys = jax.random.split(key, self.seeds)
-        return jax.vmap(self.algorithm.init, (None, 0))(env_params, keys)
+        # One after the other: batched QR decompositions, of which orthogonal weights are made, wait
+        # for each other for ever on a CPU of few cores (jaxlib 0.10).
+        return jax.lax.map(partial(self.algorithm.init, env_params), keys)
 
     def iterate(self, env_params: Any, state: State) -> tuple[State, dict[str, jax.Array]]:
         return jax.vmap(self.algorithm.iterate, (None, 0))(env_params, state)

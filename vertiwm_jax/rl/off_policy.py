@@ -101,7 +101,8 @@ class Networks:
         actor_key, critic_key = jax.random.split(key)
         action = jnp.zeros(self.actor.actions)
         keys = jax.random.split(critic_key)
-        critics = jax.vmap(self.critic.init, (0, None, None))(keys, observation, action)
+        # One after the other, as `loop.train` does with seeds.
+        critics = jax.lax.map(lambda key: self.critic.init(key, observation, action), keys)
         return self.actor.init(actor_key, observation), critics
 
     def fit_critics(
