@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +11,16 @@ import pytest
 from doors import refusal
 
 from vertiwm_jax import collect, evaluate, runs
+from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.learning.dataset import Auxiliary
 from vertiwm_jax.simulators import chrono, pilots, recording
 from vertiwm_jax.simulators.protocol import Observation, SimulatorError
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.world_model import choice
 
 GRASS, SAND = 3, 8
 STEPS = 6
@@ -213,16 +217,22 @@ def test_starts_are_level_roomy_and_near_borders(maps):
 
 
 class AtGoal:
-    """Asks for half speed, and steers by the bearing of the goal."""
+    """Asks for half speed, and steers by the bearing of the goal; is shown `size` numbers."""
+
+    def __init__(self, size):
+        self.size = size
 
     def __call__(self, observation, key):
+        assert observation.shape == (self.size,)
         return jnp.stack([0.0 * observation[8], observation[10]])
 
 
-def test_a_policy_drives_from_goal_to_goal(maps):
+@pytest.mark.parametrize("eyes", [None, choice.eyes()], ids=["arcs", "embeddings"])
+def test_a_policy_drives_from_goal_to_goal(maps, eyes):
     terrain, config = files.load(maps / "map_0.npz"), NavigationConfig(speed_range=(0.0, 5.0))
-    policy = jax.tree_util.Partial(AtGoal())
-    pilot = pilots.Learned(policy, config, terrain, np.random.default_rng(0))
+    size = OBSERVATION_SIZE + (math.prod(EMBEDDING_SHAPE) if eyes else 0)
+    policy = jax.tree_util.Partial(AtGoal(size))
+    pilot = pilots.Learned(policy, config, eyes, terrain, np.random.default_rng(0))
     state, goals = np.zeros(12, np.float32), []
     for _ in range(3):
         command = pilot(state)
@@ -236,7 +246,7 @@ def test_a_policy_drives_from_goal_to_goal(maps):
         state = np.append(goal, np.zeros(9)).astype(np.float32)
     assert np.linalg.norm(np.diff(goals, axis=0), axis=-1).min() >= 20
     command = collect.Collect(output=maps, seconds=2.0)
-    task = collect.Task(command, (policy, config), collect._single(terrain, 0), 0, drive=1)
+    task = collect.Task(command, (policy, config, eyes), collect._single(terrain, 0), 0, drive=1)
     drive = collect.record(task)
     assert drive.control.shape == (20, 2) and np.all(drive.control[:, 0] == 2.5)
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import os
 import shutil
 import signal
@@ -12,8 +13,11 @@ import numpy as np
 import pytest
 from doors import opened, refusal
 
-from vertiwm_jax import checkpoints, evaluate, policy_training, ppo, runs, sac, td3
+from vertiwm_jax import checkpoints, evaluate, export, policy_training, ppo, runs, sac, td3
 from vertiwm_jax import config as configuration
+from vertiwm_jax.deploy import run_policy
+from vertiwm_jax.dynamics import EMBEDDING_SHAPE
+from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
 from vertiwm_jax.runs import Run
@@ -135,6 +139,9 @@ def test_other_algorithms_leave_the_same_and_resume(door, folder, tmp_path):
     found = json.loads((tmp_path / "found" / "summary.json").read_text())
     assert found == json.loads((run / "summary.json").read_text())
     assert all(name in rows for rows in found.values())
+    export.main([str(run)])
+    robot = run_policy.load(run / "export")
+    assert robot(np.zeros(OBSERVATION_SIZE + math.prod(EMBEDDING_SHAPE))).shape == (2,)
 
 
 def test_what_is_set_beside_resume_is_kept(run, train, tmp_path):

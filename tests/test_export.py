@@ -1,5 +1,6 @@
 """Exported policies of every kind compute what the trained ones do, whatever runs them."""
 
+import math
 import subprocess
 import sys
 
@@ -15,6 +16,7 @@ from flax import struct
 from vertiwm_jax import checkpoints, export, runs
 from vertiwm_jax import config as configuration
 from vertiwm_jax.deploy import onnx_graph, run_policy, stablehlo
+from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env import observation
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.navigation import NavigationConfig
@@ -28,12 +30,14 @@ from vertiwm_jax.rl.normalise import RunningStatistics
 from vertiwm_jax.sac import SACTraining
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.world_model import choice
 
 CONFIG = NavigationConfig(speed_range=(-1.0, 5.0))
 ACTORS = {
     "ppo": Actor(2, (8, 6, 5), -0.5, Senses(ARCS)),
     "sac": SquashedActor(2, (8, 6), -0.5, Senses(ARCS)),
     "td3": SquashedActor(2, (8,), None, Senses(ARCS)),
+    "embeddings": Actor(2, (8, 6), -0.5, Senses(ARCS, EMBEDDING_SHAPE)),
 }
 BASES = {"look ahead": LookAhead(CONFIG), "straight to goal": StraightToGoal(CONFIG), "none": None}
 TINY = """
@@ -50,18 +54,19 @@ sac:
 def policy_of(actor, base):
     """A policy of random weights, whose actions are not all at their limits."""
     rng = np.random.default_rng(0)
-    shapes = jax.eval_shape(actor.init, jax.random.key(0), jnp.zeros(OBSERVATION_SIZE))
+    size = OBSERVATION_SIZE + math.prod(actor.senses.image or (0,))
+    shapes = jax.eval_shape(actor.init, jax.random.key(0), jnp.zeros(size))
 
     def drawn(leaf):
         return jnp.float32(rng.normal(0, 1 / np.sqrt(leaf.shape[0]), leaf.shape))
 
-    mean, variance = jnp.float32(rng.uniform(size=(2, OBSERVATION_SIZE)))
+    mean, variance = jnp.float32(rng.uniform(size=(2, size)))
     statistics = RunningStatistics(mean, variance, jnp.float32(9))
     learned = MeanAction(actor, jax.tree.map(drawn, shapes), statistics)
     return Corrected(base, learned) if base else learned
 
 
-def observations():
+def observations(image=None):
     """`[B, O]` 64 usual ones, any within the limit, and its corners; goals all about."""
     rng = np.random.default_rng(0)
     usual = rng.normal(0, 0.5, (64, OBSERVATION_SIZE))
@@ -74,7 +79,8 @@ def observations():
     seen[:64, 9], seen[:64, 10] = np.cos(bearing[:64]), np.sin(bearing[:64])
     around = [[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0], [-1, 1e-7], [-1, -1e-7]]
     seen[-len(around) :, 9:11] = around
-    return seen.astype(np.float32)
+    picture = rng.normal(size=(len(seen), math.prod(image or (0,))))
+    return np.concatenate([seen, picture], axis=1).astype(np.float32)
 
 
 def in_onnx(model, seen):
@@ -84,7 +90,7 @@ def in_onnx(model, seen):
 
 def written(policy, folder):
     """The files of a policy, as on a robot, and the policy in NumPy."""
-    made = export.files(policy, CONFIG, 8, onnx_graph.record)
+    made = export.files(policy, None, CONFIG, 8, onnx_graph.record)
     for name, data in made.items():
         runs.write_atomic(folder / name, data)
     return made, run_policy.load(folder)
@@ -101,7 +107,7 @@ def act(policy, seen):
     [(actor, "look ahead") for actor in ACTORS] + [("ppo", "straight to goal"), ("sac", "none")],
 )
 def test_all_forms_of_a_policy_agree(actor, base, tmp_path):
-    policy, seen = policy_of(ACTORS[actor], BASES[base]), observations()
+    policy, seen = policy_of(ACTORS[actor], BASES[base]), observations(ACTORS[actor].senses.image)
     made, in_numpy = written(policy, tmp_path)
     in_stablehlo = jax.export.deserialize(bytearray(made["policy.stablehlo"])).call
     expected = np.asarray(act(policy, seen))
@@ -161,8 +167,8 @@ def test_the_robot_drives_as_the_test_does(tmp_path):
     np.testing.assert_allclose(found.position, expected.position, atol=1e-3)
 
 
-@pytest.mark.parametrize("size", [129, 41])
-def test_the_observation_of_map_arrays(size):
+@pytest.mark.parametrize(("size", "sighted"), [(129, False), (41, False), (129, True)])
+def test_the_observation_of_map_arrays(size, sighted):
     semantic = np.full((16, 16), SNOW)
     semantic[:, 8:] = 0
     boxes = np.array([[18, 4, 2, 3, 1], [0, 0, 0, 0, 0]], np.float32)
@@ -170,7 +176,8 @@ def test_the_observation_of_map_arrays(size):
     arrays = (terrain.elevation, terrain.semantic, terrain.friction, terrain.obstacles)
     state = VehicleState.from_vector(jnp.array([15, 1, 2, 0.1, -0.2, 0.7, 3, 0, 0, 0, 0, 0.1]))
     goal, action = jnp.array([20.0, 5.0, 1.0]), jnp.array([0.3, -0.4])
-    exported = jax.export.deserialize(bytearray(stablehlo.observe(Chassis())))
+    eyes = choice.eyes() if sighted else None
+    exported = jax.export.deserialize(bytearray(stablehlo.observe(Chassis(), eyes)))
     arguments = (
         *(x[0] for x in arrays),
         terrain.origin,
@@ -183,6 +190,11 @@ def test_the_observation_of_map_arrays(size):
         terrain, Chassis(), state, goal, action
     )
     assert 0 < (observation.arcs_ahead(expected)[1] == 7.5).sum() < 72
+    if eyes:
+        expected = observation.with_embedding(
+            expected, jax.jit(lambda: eyes(terrain, state).latent)()
+        )
+        assert float(jnp.std(expected[OBSERVATION_SIZE:])) > 0.1
     np.testing.assert_allclose(exported.call(*arguments), expected, atol=1e-5)
 
 
@@ -233,8 +245,6 @@ def test_what_cannot_be_exported_is_named_and_leaves_nothing(run_and_policy, tmp
     assert "seed: expected 0 to 1, found 2" in refusal(export.main, run, "--seed", 2)
     (tmp_path / "config.yaml").write_text(TINY)
     assert "expected checkpoints of a training" in refusal(export.main, tmp_path)
-    (tmp_path / "config.yaml").write_text(TINY.replace("settle", "embeddings: true, settle"))
-    assert "navigation.embeddings: expected" in refusal(export.main, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
     monkeypatch.delitem(sys.modules, "vertiwm_jax.deploy.onnx_graph")
     monkeypatch.setitem(sys.modules, "onnx", None)

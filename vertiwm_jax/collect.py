@@ -36,6 +36,7 @@ from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import files, worlds
 from vertiwm_jax.terrain.map import MapError, TerrainMap
 from vertiwm_jax.terrain.worlds import Difficulty, Kind, WorldConfig
+from vertiwm_jax.world_model.perception import Eyes
 
 SIMULATORS = {"builtin": BuiltIn, "chrono": Chrono}
 SHORTEST = 0.8
@@ -96,7 +97,7 @@ class Task:
     """One drive to record: number `drive` on the selected world of `terrain`, number `world`."""
 
     command: Collect
-    learned: tuple[Policy, NavigationConfig] | None
+    learned: tuple[Policy, NavigationConfig, Eyes | None] | None
     terrain: TerrainMap
     world: int
     drive: int
@@ -210,12 +211,13 @@ def _single(terrain: TerrainMap, world: int) -> TerrainMap:
     return jax.device_get(replace(terrain, **alone))
 
 
-def _learned(run: Path | None) -> tuple[Policy, NavigationConfig] | None:
-    """What the run has learned, in host memory, and how it is to be driven."""
+def _learned(run: Path | None) -> tuple[Policy, NavigationConfig, Eyes | None] | None:
+    """What the run has learned, in host memory, how it is to be driven, and what it sees by."""
     if run is None:
         return None
     config = training(run / "config.yaml")
-    return jax.device_get(export.restore(config, run, seed=0)), config.navigation
+    policy, eyes = jax.device_get(export.restore(config, run, seed=0))
+    return policy, config.navigation, eyes
 
 
 def _claim(command: Collect) -> None:

@@ -22,6 +22,8 @@ from vertiwm_jax.policy_training import TrainConfig
 from vertiwm_jax.rl.learned import Corrected, MeanAction
 from vertiwm_jax.runs import RunError
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.world_model.choice import eyes
+from vertiwm_jax.world_model.perception import Eyes
 
 Record = Callable[..., bytes]
 
@@ -45,8 +47,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         record, config = _recorder(), training(command.run / "config.yaml")
         with runs.new_folder(folder) as unfinished:
-            policy = restore(config, command.run, command.seed)
-            made = files(policy, config.navigation, config.action_repeat, record)
+            policy, eyes = restore(config, command.run, command.seed)
+            made = files(policy, eyes, config.navigation, config.action_repeat, record)
             for name, data in made.items():
                 runs.write_atomic(unfinished / name, data)
     except (RunError, CheckpointError, ConfigError, OSError) as error:
@@ -54,45 +56,48 @@ def main(argv: Sequence[str] | None = None) -> None:
     print(f"the policy is in {folder}")
 
 
-def restore(config: TrainConfig, run: Path, seed: int) -> Corrected | MeanAction:
+def restore(
+    config: TrainConfig, run: Path, seed: int
+) -> tuple[Corrected | MeanAction, Eyes | None]:
     """What the run in the folder `run` has learned, as tests drive it without planning.
 
-    `ConfigError` or `CheckpointError` if there is no such policy.
+    Also the encoders that it sees embeddings by, if it sees any. `ConfigError` or
+    `CheckpointError` if there is no such policy.
     """
     seeds = config.loop.seeds
     if not 0 <= seed < seeds:
         raise ConfigError(f"{run}: seed: expected 0 to {seeds - 1}, found {seed}")
-    if config.navigation.embeddings:
-        raise ConfigError(
-            f"{run}: navigation.embeddings: expected a policy that sees the ground on arcs alone, "
-            "found one that needs encoders, which are not exported"
-        )
     # Checkpoints are read beside an environment of their kind, on any ground.
     level = terrain_map.build(np.zeros((129, 129)), np.zeros((1, 1), np.int32))
     policies = policy_training.learned(replace(config, planning=None), level, run)
     policy = list(policies.values())[seed]
     assert isinstance(policy, Corrected | MeanAction)
-    return policy
+    return policy, eyes(config.weights) if config.navigation.embeddings else None
 
 
 def files(
-    policy: Corrected | MeanAction, config: NavigationConfig, held: int, record: Record
+    policy: Corrected | MeanAction,
+    eyes: Eyes | None,
+    config: NavigationConfig,
+    held: int,
+    record: Record,
 ) -> dict[str, bytes | str]:
     """What the folder of a policy holds, by name.
 
-    config, held: as in `description.about`; record: `onnx_graph.record`.
+    eyes: of a policy that sees embeddings; config, held: as in `description.about`; record:
+    `onnx_graph.record`.
     """
     about, weights = description.about(policy, config, held), description.weights(policy)
     arrays = io.BytesIO()
     np.savez(arrays, allow_pickle=False, **weights)
-    sizes = about["observation"]["size"], 2
+    size = about["observation"]["size"]
     return {
         "policy.json": json.dumps(about, indent=1) + "\n",
         "policy.npz": arrays.getvalue(),
-        "policy.onnx": record(partial(run_policy.act, about, weights), *sizes),
+        "policy.onnx": record(partial(run_policy.act, about, weights), size, 2),
         # The key is not used: no learned policy is random.
-        "policy.stablehlo": stablehlo.policy(lambda seen: policy(seen, jax.random.key(0))),
-        "observe.stablehlo": stablehlo.observe(config.chassis),
+        "policy.stablehlo": stablehlo.policy(lambda seen: policy(seen, jax.random.key(0)), size),
+        "observe.stablehlo": stablehlo.observe(config.chassis, eyes),
         "run_policy.py": Path(run_policy.__file__).read_bytes(),
     }
 

@@ -1,6 +1,7 @@
 """A learned policy in plain numbers: what `policy.json` says of it, and its weights."""
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -29,14 +30,19 @@ def about(policy: Corrected | MeanAction, config: NavigationConfig, held: int) -
     places, heading = observation.poses_ahead(config.chassis)
     standing = config.action(Command(jnp.float32(0), jnp.float32(0)))
     base = policy.base if isinstance(policy, Corrected) else None
+    size, parts = observation.OBSERVATION_SIZE, LAYOUT
+    image = _learned(policy).actor.senses.image
+    if image:
+        pixels = slice(size, size + math.prod(image))
+        size, parts = pixels.stop, {**parts, "embedding": Part(pixels, "1", 1.0)}
     return {
         "vertiwm_jax": vertiwm_jax.__version__,
         "step_seconds": STEP_SECONDS,
         "held_while_learning": held,
         "observation": {
-            "size": observation.OBSERVATION_SIZE,
+            "size": size,
             "limit": observation.OBSERVATION_LIMIT,
-            "parts": {name: _part(part) for name, part in LAYOUT.items()},
+            "parts": {name: _part(part) for name, part in parts.items()},
             "places": np.column_stack([places, heading]).tolist(),
             "class_places": observation.CLASS_PLACES.tolist(),
         },
@@ -48,6 +54,7 @@ def about(policy: Corrected | MeanAction, config: NavigationConfig, held: int) -
         "arcs": {"steering": ARC_STEERING.tolist(), "stations": ARC_STATIONS.tolist()},
         "network": {
             "normalised_limit": normalise.CLIP,
+            "embedding": image,
             "squashed": isinstance(_learned(policy).actor, SquashedActor),
         },
         "base": None if base is None else {"name": _BASES[type(base)], **_numbers(base)},

@@ -76,7 +76,9 @@ def _learned(about: About, weights: Weights, observation: np.ndarray) -> np.ndar
 
     before, after = _slice(about, "height").start, _slice(about, "twist").stop
     here = [_part(about, seen, name)[:, :1] for name in ground]
-    rest = np.concatenate([seen[:, :before], *here, seen[:, after:]], axis=-1)
+    classes = seen[:, after : _slice(about, "sinkage").stop]
+    shown = [_compressed(about, weights, seen)] if about["network"]["embedding"] else []
+    rest = np.concatenate([seen[:, :before], *here, classes, *shown], axis=-1)
     arcs = np.concatenate([_arcs(about, seen, name) for name in ground], axis=-1)
 
     (context, _), (kernel, bias), *more, (score, score_bias) = _layers(weights, "Attention_0")
@@ -94,6 +96,16 @@ def _learned(about: About, weights: Weights, observation: np.ndarray) -> np.ndar
     # Networks that also say how certain they are do so in what is left out here.
     mean = features @ kernel[:, :2] + bias[:2] + steered * _float32([0, 1])
     return np.tanh(mean) if about["network"]["squashed"] else mean
+
+
+def _compressed(about: About, weights: Weights, seen: np.ndarray) -> np.ndarray:
+    """The picture of the ground to `[B, 16]`: each tile of 4 x 4, then all tiles together."""
+    rows, columns, channels = about["network"]["embedding"]
+    (kernel, bias), (together, last_bias) = _layers(weights, "Compressor_0")
+    shape = (-1, rows // 4, 4, columns // 4, 4 * channels)
+    picture, kernel = np.reshape(_part(about, seen, "embedding"), shape), np.split(kernel, 4)
+    tiles = np.tanh(sum(picture[:, :, row] @ kernel[row] for row in range(4)) + bias)
+    return np.tanh(np.reshape(tiles, (-1, len(together))) @ together + last_bias)
 
 
 def _look_ahead(about: About, observation: np.ndarray) -> np.ndarray:

@@ -10,27 +10,30 @@ from jax import export
 
 from vertiwm_jax.env import observation
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.classes import STANDARD
 from vertiwm_jax.terrain.map import ELEVATION_RANGE, TerrainMap
+from vertiwm_jax.world_model.perception import Eyes
 
 PLATFORMS = ("cpu", "cuda")
 
 
-def policy(act: Callable[[jax.Array], jax.Array]) -> bytes:
-    """`act`, `[B, O]` float32 observations to `[B, 2]` actions, for any B."""
+def policy(act: Callable[[jax.Array], jax.Array], size: int) -> bytes:
+    """`act`, `[B, size]` float32 observations to `[B, 2]` actions, for any B."""
     (batch,) = export.symbolic_shape("batch")
-    return _serialised(act, _floats(batch, OBSERVATION_SIZE))
+    return _serialised(act, _floats(batch, size))
 
 
-def observe(chassis: Chassis) -> bytes:
-    """`observation.observe` of map arrays, for maps of any size; the arguments of `_observe`."""
+def observe(chassis: Chassis, eyes: Eyes | None) -> bytes:
+    """`observation.observe` of map arrays, for maps of any size; the arguments of `_observe`.
+
+    With eyes, the observation ends with what they see.
+    """
     rows, columns, cell_rows, cell_columns, boxes = export.symbolic_shape(
         "rows, columns, cell_rows, cell_columns, boxes"
     )
     return _serialised(
-        partial(_observe, chassis),
+        partial(_observe, chassis, eyes),
         _floats(rows, columns),
         jax.ShapeDtypeStruct((cell_rows, cell_columns), jnp.uint8),
         _floats(cell_rows, cell_columns),
@@ -45,6 +48,7 @@ def observe(chassis: Chassis) -> bytes:
 
 def _observe(
     chassis: Chassis,
+    eyes: Eyes | None,
     elevation: jax.Array,
     semantic: jax.Array,
     friction: jax.Array,
@@ -73,7 +77,9 @@ def _observe(
         world=jnp.int32(0),
         class_names=STANDARD.names,
     )
-    return observation.observe(terrain, chassis, VehicleState.from_vector(state), goal, action)
+    vehicle = VehicleState.from_vector(state)
+    seen = observation.observe(terrain, chassis, vehicle, goal, action)
+    return observation.with_embedding(seen, eyes(terrain, vehicle).latent) if eyes else seen
 
 
 def _floats(*shape: Any) -> jax.ShapeDtypeStruct:

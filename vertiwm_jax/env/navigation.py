@@ -288,13 +288,11 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         return Senses(observation.ARCS, EMBEDDING_SHAPE if self.config.embeddings else None)
 
     def _see(self, terrain: TerrainMap, state: NavigationState) -> jax.Array:
-        chassis, limit = self.config.chassis, observation.OBSERVATION_LIMIT
+        chassis = self.config.chassis
         seen = observation.observe(terrain, chassis, state.vehicle, state.goal, state.action)
         if not self.config.embeddings:
             return seen
-        # The history goes on where the model diverged, and what it sees there may be anything.
-        embedded = jnp.nan_to_num(embedding(state.history).ravel())
-        return jnp.concatenate([seen, jnp.clip(embedded, -limit, limit)])
+        return observation.with_embedding(seen, embedding(state.history))
 
     def _is_plausible(
         self, terrain: TerrainMap, vehicle: VehicleState, apart: jax.Array

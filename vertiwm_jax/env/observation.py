@@ -193,3 +193,11 @@ def observe(
 
     observation = jnp.concatenate([*motion, *ground, classes.ravel()])
     return jnp.clip(observation, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+
+
+def with_embedding(observation: jax.Array, embedding: jax.Array) -> jax.Array:
+    """The observation of a policy that also sees the ground as encoders do, `EMBEDDING_SHAPE`."""
+    # What a model sees where it has diverged may be anything.
+    finite = jnp.nan_to_num(embedding.ravel())
+    clipped = jnp.clip(finite, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+    return jnp.concatenate([observation, clipped])

@@ -16,6 +16,7 @@ from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model.perception import Eyes
 
 Pilot = Callable[[np.ndarray], np.ndarray]
 """State `[12]` to the command `[2]` of the next step: speed, m/s, and front-wheel angle, rad."""
@@ -83,10 +84,14 @@ def sinusoids(rng: np.random.Generator, steps: int) -> Pilot:
 
 @dataclass
 class Learned:
-    """Follows a policy from goal to goal; the next is drawn where one is reached."""
+    """Follows a policy from goal to goal; the next is drawn where one is reached.
+
+    eyes: of a policy that sees embeddings of the ground.
+    """
 
     policy: Policy
     config: NavigationConfig
+    eyes: Eyes | None
     terrain: TerrainMap
     rng: np.random.Generator
 
@@ -101,7 +106,7 @@ class Learned:
         if goal is None or np.linalg.norm(goal - state[:3]) < self.config.goal_radius:
             self._goal = goal = self._draw_goal(state[:2])
         self._action, command = jax.device_get(
-            _act(self.config, self.policy, self.terrain, state, goal, self._action)
+            _act(self.config, self.policy, self.eyes, self.terrain, state, goal, self._action)
         )
         return command
 
@@ -117,6 +122,7 @@ class Learned:
 def _act(
     config: NavigationConfig,
     policy: Policy,
+    eyes: Eyes | None,
     terrain: TerrainMap,
     state: jax.Array,
     goal: jax.Array,
@@ -125,6 +131,8 @@ def _act(
     """The next action `[2]` and the command `[2]` that it stands for."""
     vehicle = VehicleState.from_vector(state)
     seen = observation.observe(terrain, config.chassis, vehicle, goal, action)
+    if eyes:
+        seen = observation.with_embedding(seen, eyes(terrain, vehicle).latent)
     # No learned policy is random.
     action = jnp.clip(policy(seen, jax.random.key(0)), -1.0, 1.0)
     return action, config.command(action).vector

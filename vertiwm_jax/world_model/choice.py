@@ -9,8 +9,9 @@ from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.world_model import model
+from vertiwm_jax.world_model.model import ModelConfig
 from vertiwm_jax.world_model.nesam import SoilSource
-from vertiwm_jax.world_model.perception import Sighted, SightedParams
+from vertiwm_jax.world_model.perception import Eyes, Sighted, SightedParams
 
 ModelName = Literal["builtin", "transformer", "nesam", "vertiwm"]
 """The simulator, which has learned nothing; either specialist; both of them fused."""
@@ -42,18 +43,16 @@ def sighted(
     So a policy learns and drives by the same eyes everywhere. What the model has computed already
     is not computed again. Raises like `choose`, with "transformer".
     """
-    folder = weights or model.PRETRAINED
-    config, found = model.load(folder)
-    if "transformer" not in config.parts or config.terrain != "patches":
-        raise CheckpointError(
-            f"{folder}: expected the encoders of a Transformer, for navigation.embeddings, "
-            f"found {' and '.join(config.parts)} with terrain {config.terrain!r}"
-        )
+    config, seen_by = _eyes(weights)
     seeing = {"vertiwm", "transformer"} | ({"nesam"} if config.encoders == "shared" else set())
     if name in seeing:
         return dynamics, params
-    encoders = found.transformer.encoders
-    return Sighted(dynamics, config.transformer.exteroception), SightedParams(params, encoders)
+    return Sighted(dynamics), SightedParams(params, seen_by)
+
+
+def eyes(weights: Path | None = None) -> Eyes:
+    """The Transformer's encoders, by which policies see; raises like `sighted`."""
+    return _eyes(weights)[1]
 
 
 def fitted(
@@ -73,3 +72,14 @@ def fitted(
     if "transformer" in config.parts:
         models["transformer"] = (config.transformer, params.transformer)
     return models
+
+
+def _eyes(weights: Path | None) -> tuple[ModelConfig, Eyes]:
+    folder = weights or model.PRETRAINED
+    config, found = model.load(folder)
+    if "transformer" not in config.parts or config.terrain != "patches":
+        raise CheckpointError(
+            f"{folder}: expected the encoders of a Transformer, for navigation.embeddings, "
+            f"found {' and '.join(config.parts)} with terrain {config.terrain!r}"
+        )
+    return config, Eyes(config.transformer.exteroception, found.transformer.encoders)

@@ -80,11 +80,26 @@ class Exteroception:
 
 
 @struct.dataclass
+class Eyes:
+    """Encoders that look at the ground, apart from any model.
+
+    exteroception: how they look, static; params: their weights.
+    """
+
+    exteroception: Exteroception = struct.field(pytree_node=False)
+    params: EncoderParams
+
+    def __call__(self, terrain: TerrainMap, state: VehicleState) -> Perception:
+        """What they see at one vehicle's pose."""
+        return self.exteroception.encode(self.params, self.exteroception.query(terrain, state))
+
+
+@struct.dataclass
 class SightedParams:
-    """dynamics: of the model that moves; encoders: of what it is made to see by."""
+    """dynamics: of the model that moves; eyes: what it is made to see by."""
 
     dynamics: Params
-    encoders: EncoderParams
+    eyes: Eyes
 
 
 @struct.dataclass
@@ -103,14 +118,13 @@ class Sighted:
     """
 
     dynamics: Dynamics
-    exteroception: Exteroception = Exteroception()
 
     def init(
         self, params: SightedParams, terrain: TerrainMap, state: VehicleState
     ) -> SightedHistory:
         """The model's history, and a look at the ground."""
         history = self.dynamics.init(params.dynamics, terrain, state)
-        return SightedHistory(history, self._look(params, terrain, state))
+        return SightedHistory(history, params.eyes(terrain, state))
 
     def step(
         self,
@@ -122,11 +136,7 @@ class Sighted:
     ) -> tuple[VehicleState, SightedHistory]:
         """The model's next state, and a look at the ground there."""
         state, moved = self.dynamics.step(params.dynamics, terrain, history.history, state, command)
-        return state, SightedHistory(moved, self._look(params, terrain, state))
-
-    def _look(self, params: SightedParams, terrain: TerrainMap, state: VehicleState) -> Perception:
-        patches = self.exteroception.query(terrain, state)
-        return self.exteroception.encode(params.encoders, patches)
+        return state, SightedHistory(moved, params.eyes(terrain, state))
 
 
 class Specialist(Dynamics, Protocol):
