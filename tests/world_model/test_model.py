@@ -52,21 +52,18 @@ class SeeingBicycle:
     bicycle: KinematicBicycle = KinematicBicycle()
 
     def init(self, params, terrain, state):
-        perception = self.perceive(params, self.exteroception.query(terrain, state))
+        (perception,) = self.exteroception.look((params.encoders,), terrain, state)
         return SeeingHistory(self.bicycle.init(params.physics, terrain, state), perception)
 
     def step(self, params, terrain, history, state, command):
         state, history = self.propose(params, terrain, history, state, command)
-        perception = self.perceive(params, self.exteroception.query(terrain, state))
+        (perception,) = self.exteroception.look((params.encoders,), terrain, state)
         return state, replace(history, perception=perception)
 
     def propose(self, params, terrain, history, state, command):
         arguments = (params.physics, terrain, history.physics, state, command)
         state, physics = self.bicycle.step(*arguments)
         return state, replace(history, physics=physics)
-
-    def perceive(self, params, patches):
-        return self.exteroception.encode(params.encoders, patches)
 
 
 TRANSFORMER, PHYSICS = TransformerSpecialist(replace(TINY, layers=1)), SeeingBicycle()

@@ -197,7 +197,7 @@ class VertiWM:
         """Both specialists propose from the fused state, and see the next one."""
         first, second, following = self._propose(params, terrain, history, state, command)
         context = fusion.context(state, command, first, second, self.gate_terrain)
-        alpha, hidden = self._weigh(params.gate, context, history.hidden)
+        alpha, hidden = self.weigh(params.gate, context, history.hidden)
         state = fusion.fuse(state, first, second, alpha)
         apart = jnp.linalg.norm(jax.lax.stop_gradient(second.increment - first.increment)[:3])
         following = replace(following, hidden=hidden, coefficients=alpha, disagreement=apart)
@@ -240,7 +240,7 @@ class VertiWM:
         second = Proposal.of(state, by_nesam, history.nesam.perception)
         return first, second, replace(history, transformer=transformer, nesam=nesam)
 
-    def _weigh(
+    def weigh(
         self, gate: GateParams, context: jax.Array, hidden: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """The coefficients `[4]` and the gate's next state (Eqs. 6, 7)."""
@@ -261,12 +261,16 @@ class VertiWM:
         state: VehicleState,
     ) -> VertiWMHistory:
         """The history with what both see at a state."""
-        patches = self.transformer.exteroception.query(terrain, state)
-        by_transformer = by_nesam = self.transformer.perceive(params.transformer, patches)
-        if self.encoders == "own":
-            if self.nesam.exteroception.patches != self.transformer.exteroception.patches:
-                patches = self.nesam.exteroception.query(terrain, state)
-            by_nesam = self.nesam.perceive(params.nesam, patches)
+        encoders = params.transformer.encoders, params.nesam.encoders
+        both = self.transformer.exteroception, self.nesam.exteroception
+        if self.encoders == "shared":
+            (by_transformer,) = both[0].look(encoders[:1], terrain, state)
+            by_nesam = by_transformer
+        elif both[0] == both[1]:
+            by_transformer, by_nesam = both[0].look(encoders, terrain, state)
+        else:
+            (by_transformer,) = both[0].look(encoders[:1], terrain, state)
+            (by_nesam,) = both[1].look(encoders[1:], terrain, state)
         return replace(
             history,
             transformer=replace(history.transformer, perception=by_transformer),

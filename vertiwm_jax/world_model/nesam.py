@@ -11,7 +11,7 @@ from vertiwm_jax.mechanics.simulator import Simulator, SimulatorHistory, Simulat
 from vertiwm_jax.networks.encoder import LATENT_CHANNELS
 from vertiwm_jax.networks.soil_predictor import SoilPredictor
 from vertiwm_jax.networks.transformer import KeyValueCache
-from vertiwm_jax.state import Command, Patches, VehicleState
+from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
 from vertiwm_jax.world_model import motion, step_features
@@ -148,10 +148,6 @@ class Nesam:
         correction = _correction(params, outputs)
         return motion.corrected(physics, correction), replace(following, cache=cache)
 
-    def perceive(self, params: NesamParams, patches: Patches) -> Perception:
-        """The patches as its encoders see them."""
-        return self.exteroception.encode(params.encoders, patches)
-
     def follow(
         self,
         params: NesamParams,
@@ -198,7 +194,7 @@ class Nesam:
         return SpecialistNetwork(self.size)
 
     def _look(self, params: NesamParams, terrain: TerrainMap, state: VehicleState) -> Perception:
-        return self.perceive(params, self.exteroception.query(terrain, state))
+        return self.exteroception.look((params.encoders,), terrain, state)[0]
 
     def _ground(
         self, params: NesamParams, terrain: TerrainMap, perception: Perception

@@ -13,8 +13,10 @@ from vertiwm_jax.state import Command, Patches, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.query import PATCH_PIXELS, PatchConfig
+from vertiwm_jax.world_model.batching import few_at_a_time
 
 _ELEVATION, _SEMANTIC = TerrainEncoder(1), TerrainEncoder(3)
+_TOGETHER = 16  # vehicles, whose patches of 260 kB each stay near a core
 
 
 @struct.dataclass
@@ -66,6 +68,25 @@ class Exteroception:
             _ELEVATION.init(keys[0], patch[..., :1]), _SEMANTIC.init(keys[1], patch)
         )
 
+    def look(
+        self, encoders: tuple[EncoderParams, ...], terrain: TerrainMap, state: VehicleState
+    ) -> tuple[Perception, ...]:
+        """What pairs of encoders see at one vehicle's pose, all of the same patches.
+
+        The map counts as given, like the pose: unless encoders are tuned, no gradient flows.
+        """
+
+        def look(
+            encoders: tuple[EncoderParams, ...], terrain: TerrainMap, state: VehicleState
+        ) -> tuple[Perception, ...]:
+            patches = self.query(terrain, state)
+            return tuple(self.encode(params, patches) for params in encoders)
+
+        if self.tune_encoders:
+            return look(encoders, terrain, state)
+        given = jax.lax.stop_gradient((encoders, terrain, state))
+        return few_at_a_time(look, _TOGETHER)(*given)
+
     def query(self, terrain: TerrainMap, state: VehicleState) -> Patches:
         """The patches at one vehicle's pose, which counts as given: Q(M; sg(T))."""
         return query.patches(terrain, state.position, state.rpy[2], self.patches)
@@ -91,7 +112,8 @@ class Eyes:
 
     def __call__(self, terrain: TerrainMap, state: VehicleState) -> Perception:
         """What they see at one vehicle's pose."""
-        return self.exteroception.encode(self.params, self.exteroception.query(terrain, state))
+        (perception,) = self.exteroception.look((self.params,), terrain, state)
+        return perception
 
 
 @struct.dataclass
@@ -142,8 +164,9 @@ class Sighted:
 class Specialist(Dynamics, Protocol):
     """A `Dynamics` whose step is a proposal, and then a look at where it leads.
 
-    Its history has a field `perception` and can be changed with `dataclasses.replace`. The fused
-    model lets both specialists propose, fuses, and gives each its perception of the fused state.
+    Its parameters have a field `encoders`; its history has a field `perception` and can be changed
+    with `dataclasses.replace`. The fused model lets both specialists propose, fuses, and gives each
+    its perception of the fused state.
     """
 
     @property
@@ -158,8 +181,4 @@ class Specialist(Dynamics, Protocol):
         command: Command,
     ) -> tuple[VehicleState, History]:
         """`step` up to the next state; `history.perception` is still that of `state`."""
-        ...
-
-    def perceive(self, params: Params, patches: Patches) -> Perception:
-        """The patches as this specialist's encoders see them."""
         ...

@@ -9,7 +9,7 @@ from flax import struct
 
 from vertiwm_jax.networks.encoder import LATENT_CHANNELS
 from vertiwm_jax.networks.transformer import KeyValueCache
-from vertiwm_jax.state import Command, Patches, VehicleState
+from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import motion
@@ -102,11 +102,6 @@ class TransformerSpecialist:
         proposed = motion.advance(state, params.normalisation.transition(output))
         return proposed, replace(history, cache=cache)
 
-    def perceive(self, params: TransformerParams, patches: Patches) -> Perception:
-        """The patches as its encoders see them."""
-        assert params.encoders is not None, "F_T without terrain patches perceives nothing"
-        return self.exteroception.encode(params.encoders, patches)
-
     def follow(
         self,
         params: TransformerParams,
@@ -132,7 +127,8 @@ class TransformerSpecialist:
     ) -> Perception | None:
         if self.terrain != "patches":
             return None
-        return self.perceive(params, self.exteroception.query(terrain, state))
+        assert params.encoders is not None, "without encoders it cannot look at patches"
+        return self.exteroception.look((params.encoders,), terrain, state)[0]
 
     def _inputs(
         self,

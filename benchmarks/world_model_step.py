@@ -1,0 +1,141 @@
+"""A step of the shipped Verti-WM, part by part: what it has to compute, and what that takes.
+
+The floor of a part is what its FLOPs, or its inputs and outputs, would take at the machine's own
+ceilings, which are measured first: a matmul of 1024 x 1024, and the addition of two large arrays.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks._harness import Figures, measure, parser, report
+from benchmarks.models import drives
+from vertiwm_jax.world_model import fusion
+from vertiwm_jax.world_model.fusion import Proposal
+from vertiwm_jax.world_model.model import VertiWM
+
+Part = tuple[Callable[..., Any], tuple[Any, ...]]
+"""A function of vehicles, vmapped, and its arguments."""
+
+
+def parts(batch: int) -> dict[str, Part]:
+    """Every part of a step on `batch` vehicles after their first step, and the whole."""
+    model, params = VertiWM.pretrained()
+    transformer, nesam, encoders = model.transformer, model.nesam, params.transformer.encoders
+    terrain, states, commands = drives(batch, 1)
+    command = jax.tree.map(lambda x: x[:, 0], commands)
+
+    def step(history: Any, state: Any, command: Any) -> Any:
+        return model.step(params, terrain, history, state, command)
+
+    start = jax.jit(jax.vmap(lambda state: model.init(params, terrain, state)))
+    state, history = jax.jit(jax.vmap(step))(start(states), states, command)
+
+    def look(state: Any) -> Any:
+        return transformer.exteroception.query(terrain, state)
+
+    patches = jax.jit(jax.vmap(look))(state)
+    first, second = (
+        jax.jit(jax.vmap(lambda m, s, c, one=one, p=p: one.propose(p, terrain, m, s, c)[0]))(
+            memory, state, command
+        )
+        for one, p, memory in (
+            (transformer, params.transformer, history.transformer),
+            (nesam, params.nesam, history.nesam),
+        )
+    )
+
+    def physics(memory: Any, state: Any, command: Any) -> Any:
+        return nesam.simulator.step(params.nesam.simulator, terrain, memory, state, command)
+
+    def gate(history: Any, state: Any, command: Any, first: Any, second: Any) -> Any:
+        proposals = (
+            Proposal.of(state, first, history.transformer.perception),
+            Proposal.of(state, second, history.nesam.perception),
+        )
+        context = fusion.context(state, command, *proposals, model.gate_terrain)
+        alpha, hidden = model.weigh(params.gate, context, history.hidden)
+        return fusion.fuse(state, *proposals, alpha), hidden
+
+    driven = (state, command)
+    return {
+        "map query: heights": (lambda state: look(state).elevation, (state,)),
+        "map query: colours": (lambda state: look(state).rgb, (state,)),
+        "encoders": (lambda seen: transformer.exteroception.encode(encoders, seen), (patches,)),
+        "query and encoders together": (
+            lambda state: transformer.exteroception.look((encoders,), terrain, state),
+            (state,),
+        ),
+        "Transformer": (
+            lambda m, s, c: transformer.propose(params.transformer, terrain, m, s, c),
+            (history.transformer, *driven),
+        ),
+        "NeSAM: physics": (physics, (history.nesam.simulator, *driven)),
+        "NeSAM: physics and network": (
+            lambda m, s, c: nesam.propose(params.nesam, terrain, m, s, c),
+            (history.nesam, *driven),
+        ),
+        "gate and fused motion": (gate, (history, *driven, first, second)),
+        "the whole step": (step, (history, *driven)),
+    }
+
+
+def ceilings() -> dict[str, float]:
+    """FLOP/s of a matmul and bytes/s of a sum of large arrays, on this machine, now."""
+    a, b = jax.random.normal(jax.random.key(0), (2, 1024, 1024))
+    matmul = measure(jax.jit(jnp.matmul), a, b)
+    x, y = jnp.ones((2, 1 << 25))
+    stream = measure(jax.jit(jnp.add), x, y)
+    return {"flops": 2 * 1024**3 / matmul["min_s"], "bytes": 3 * x.nbytes / stream["min_s"]}
+
+
+def cost(part: Part, batch: int) -> tuple[float, float]:
+    """FLOPs of one vehicle, and bytes that it reads and leaves, at least.
+
+    The compiler counts the operations of a loop once; physics has no other than its sub-steps.
+    """
+    function, arguments = part
+    flops = jax.jit(jax.vmap(function)).lower(*arguments).compile().cost_analysis()["flops"]
+    leaves = jax.tree.leaves((arguments, jax.eval_shape(jax.vmap(function), *arguments)))
+    return flops / batch, sum(leaf.size * leaf.dtype.itemsize for leaf in leaves) / batch
+
+
+def figures(batch: int) -> dict[str, Figures]:
+    """A row for every part."""
+    limits, chosen = ceilings(), parts(batch)
+    times = {
+        name: measure(jax.jit(jax.vmap(function)), *arguments)
+        for name, (function, arguments) in chosen.items()
+    }
+    whole = times["the whole step"]["median_s"]
+    rows: dict[str, Figures] = {
+        "ceilings": {"GFLOP/s": limits["flops"] / 1e9, "GB/s": limits["bytes"] / 1e9}
+    }
+    for name, part in chosen.items():
+        flops, size = cost(part, batch)
+        floor = max(flops / limits["flops"], size / limits["bytes"])
+        rows[f"batch {batch}: {name}"] = {
+            "kFLOP": flops / 1e3,
+            "kB": size / 1e3,
+            "floor_us": 1e6 * floor,
+            "measured_us": 1e6 * times[name]["median_s"] / batch,
+            "share": times[name]["median_s"] / whole,
+            "first_call_s": times[name]["first_call_s"],
+        }
+    return rows
+
+
+def main() -> None:
+    arguments = parser(__doc__)
+    arguments.add_argument("--batches", nargs="+", type=int, default=(1, 20, 256, 1024, 4096))
+    chosen = arguments.parse_args()
+    results: dict[str, Figures] = {}
+    for batch in chosen.batches:
+        results |= figures(batch)
+    report("world_model_step", results, chosen.json)
+
+
+if __name__ == "__main__":
+    main()
