@@ -80,10 +80,16 @@ def read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise
     except Exception as error:  # Zip, codecs and NumPy's header parser each have their own.
         raise DataError(f"{path}: expected an .npz archive of plain arrays: {error}") from error
-    _check_shapes(path, arrays)
-    arrays |= {name: arrays[name].astype(np.float32) for name in _FLOATS if name in arrays}
-    _check_values(path, arrays)
+    arrays = check(path, arrays)
     return arrays, _parse(path, meta, "wheel_class" in arrays)
+
+
+def check(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Arrays of the schema in float32; raises `DataError`, which names `path`, unless all fit."""
+    _check_shapes(path, arrays)
+    arrays = arrays | {name: arrays[name].astype(np.float32) for name in _FLOATS if name in arrays}
+    _check_values(path, arrays)
+    return arrays
 
 
 def check_classes(path: Path, wheel_class: np.ndarray, classes: int) -> None:

@@ -1,0 +1,1 @@
+"""Logged drives of other origin as recorded drives of this project: one file a kind of log."""

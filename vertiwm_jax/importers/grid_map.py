@@ -1,0 +1,140 @@
+"""The ground of a collection from the GridMap messages of its bags."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from vertiwm_jax.importers import rosbag
+from vertiwm_jax.importers.settings import Frames, GridMapSettings
+from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.classes import STANDARD
+from vertiwm_jax.terrain.map import TerrainMap
+
+_KIND = "grid_map_msgs/msg/GridMap"
+
+
+class Canvas:
+    """Layers on one raster that grows with what is painted; the newest value of a cell stays.
+
+    Cell (i, j) lies at x = resolution (corner[0] + i), y = resolution (corner[1] + j), m, plus
+    what the first patch was off from whole cells.
+    """
+
+    def __init__(self, layers: int, resolution: float) -> None:
+        self.resolution = resolution
+        self.values = np.full((layers, 0, 0), np.nan, np.float32)
+        self.corner = np.zeros(2, int)
+        self._offset: np.ndarray | None = None
+
+    @property
+    def origin(self) -> np.ndarray:
+        """`[2]` x, y of cell (0, 0), m."""
+        assert self._offset is not None
+        return self.resolution * self.corner + self._offset
+
+    def paint(self, patch: np.ndarray, origin: np.ndarray) -> None:
+        """`[L, I, J]` values, NaN where there are none, of which cell (0, 0) lies at `[2]` m."""
+        if self._offset is None:
+            self.corner = np.floor(origin / self.resolution).astype(int)
+            self._offset = origin - self.resolution * self.corner
+        first = np.rint((origin - self._offset) / self.resolution).astype(int)
+        before = np.maximum(self.corner - first, 0)
+        after = np.maximum(first + patch.shape[1:] - self.corner - self.values.shape[1:], 0)
+        if before.any() or after.any():
+            margins = [(0, 0), *zip(before, after, strict=True)]
+            self.values = np.pad(self.values, margins, constant_values=np.nan)
+            self.corner = self.corner - before
+        i, j = first - self.corner
+        under = self.values[:, i : i + patch.shape[1], j : j + patch.shape[2]]
+        under[:] = np.where(np.isfinite(patch), patch, under)
+
+
+def terrain(
+    paths: Sequence[Path], wanted: GridMapSettings, frames: Frames
+) -> tuple[TerrainMap, float]:
+    """The ground that all messages of the bags tell of, and the share of it that none does.
+
+    Heights of such cells are those of the nearest cell. Raises `DataError` naming bag, topic and
+    expectation, and `MapError` if the heights make no map.
+    """
+    names = [wanted.elevation] + ([wanted.semantic] if wanted.semantic else [])
+    canvas = None
+    for path in paths:
+        name = f"{path}: {wanted.topic}"
+        for _, message in rosbag.messages(path, wanted.topic, (_KIND,)):
+            canvas = canvas or Canvas(len(names), message.info.resolution)
+            if not np.isclose(message.info.resolution, canvas.resolution):
+                raise DataError(
+                    f"{name}: expected {canvas.resolution:g} m between cells as before, found "
+                    f"{message.info.resolution:g}"
+                )
+            canvas.paint(*_patch(name, message, names))
+    assert canvas is not None  # A topic without messages is refused.
+    return _build(f"{paths[0]}: {wanted.topic}", canvas, wanted, frames)
+
+
+def _build(
+    name: str, canvas: Canvas, wanted: GridMapSettings, frames: Frames
+) -> tuple[TerrainMap, float]:
+    known = np.isfinite(canvas.values[0])
+    if not known.any():
+        raise DataError(f"{name}: {wanted.elevation}: expected heights, found none that is finite")
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    heights = canvas.values[0][tuple(np.asarray(nearest))]
+    ground = np.full(known.shape, STANDARD.names.index(wanted.ground))
+    if wanted.semantic:
+        layer = canvas.values[1]
+        ground = np.where(np.isfinite(layer), np.rint(np.nan_to_num(layer)), ground).astype(int)
+    x, y, z = frames.origin
+    west, south = canvas.origin - [x, y]
+    north = south + (known.shape[1] - 1) * canvas.resolution
+    built = terrain_map.build(
+        _rows(heights - z),
+        _rows(ground),
+        resolution=canvas.resolution,
+        origin=(west, north),
+        elevation_range=wanted.elevation_range,
+        name=name,
+    )
+    return built, float(1 - known.mean())
+
+
+def _rows(values: np.ndarray) -> np.ndarray:
+    """`[I, J]` by x and y, both rising, to `[J, I]` with the largest y first."""
+    return values.T[::-1]
+
+
+def _patch(name: str, message: Any, layers: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """`[L, I, J]` layers by x and y, both rising, and `[2]` x, y of cell (0, 0), m."""
+    info = message.info
+    q = info.pose.orientation
+    if abs(q.x) + abs(q.y) + abs(q.z) > 1e-6:
+        raise DataError(f"{name}: expected a map along the axes of its frame, found a turned one")
+    # Index (0, 0) lies at the largest x and y, once the ring buffer is unrolled.
+    start = -message.outer_start_index, -message.inner_start_index
+    patch = np.stack(
+        [np.roll(_layer(name, message, layer), start, (0, 1))[::-1, ::-1] for layer in layers]
+    )
+    centre = np.array([info.pose.position.x, info.pose.position.y])
+    return patch, centre - info.resolution * (np.array(patch.shape[1:]) - 1) / 2
+
+
+def _layer(name: str, message: Any, layer: str) -> np.ndarray:
+    """`[rows, columns]`, which fall in x and in y, as they lie in the ring buffer."""
+    if layer not in message.layers:
+        raise DataError(f"{name}: expected a layer {layer}, found {', '.join(message.layers)}")
+    array = message.data[message.layers.index(layer)]
+    outer, inner = array.layout.dim[0], array.layout.dim[1]
+    labels = (outer.label, inner.label)
+    values = np.asarray(array.data, np.float32).reshape(outer.size, inner.size)
+    if labels == ("column_index", "row_index"):
+        return values.T
+    if labels == ("row_index", "column_index"):
+        return values
+    raise DataError(
+        f"{name}: {layer}: expected dimensions column_index and row_index, found {labels}"
+    )

@@ -1,0 +1,119 @@
+"""A drive as it was logged: checked, in SI units and in the axes of this project."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vertiwm_jax.importers.settings import ImportSettings
+from vertiwm_jax.learning.schema import DataError
+
+
+@dataclass(frozen=True)
+class Log:
+    """N poses of the logged point and M commands, each with stamps of their own.
+
+    time: `[N]` s, increasing; position: `[N, 3]` p_world, m; rotation: N of body to world;
+    velocity: `[N, 3]` v_body, m/s, angular_velocity: `[N, 3]` omega_body, rad/s, None where they
+    were not logged; command_time: `[M]` s, increasing; command: `[M, 2]` m/s and rad.
+    """
+
+    time: np.ndarray
+    position: np.ndarray
+    rotation: Rotation
+    velocity: np.ndarray | None
+    angular_velocity: np.ndarray | None
+    command_time: np.ndarray
+    command: np.ndarray
+
+
+def build(
+    name: str | Path,
+    settings: ImportSettings,
+    time: np.ndarray,
+    position: np.ndarray,
+    attitude: np.ndarray,
+    command_time: np.ndarray,
+    command: np.ndarray,
+    velocity: np.ndarray | None = None,
+    angular_velocity: np.ndarray | None = None,
+) -> Log:
+    """The log with these arrays, which are in its own units and frames.
+
+    time: `[N]`; position: `[N, 3]`; attitude: `[N, 3]` roll, pitch, yaw or `[N, 4]` quaternions
+    x, y, z, w; velocity, angular_velocity: `[N, 3]`; command_time: `[M]`; command: `[M, 2]` speed
+    and steering. Raises `DataError`, which calls the log `name`, unless all are finite, stamps
+    increase and quaternions have length 1.
+    """
+    arrays = {
+        "time": time,
+        "position": position,
+        "attitude": attitude,
+        "velocity": velocity,
+        "angular_velocity": angular_velocity,
+        "time of commands": command_time,
+        "command": command,
+    }
+    for field, array in arrays.items():
+        if array is not None:
+            _check_finite(name, field, array)
+    _check_increasing(name, "time", time)
+    _check_increasing(name, "time of commands", command_time)
+    units, frames = settings.units, settings.frames
+    # Half a turn about x takes z_down to z_up, in the world and in the body.
+    axes = np.array([1, 1, 1] if frames.axes == "z_up" else [1, -1, -1])
+    if attitude.shape[1] == 3:
+        rpy = axes * units.angle * attitude
+        rotation = Rotation.from_euler("ZYX", rpy[:, ::-1])
+    else:
+        _check_length(name, attitude)
+        rotation = Rotation.from_quat(attitude * [*axes, 1])
+    if velocity is not None:
+        velocity = axes * units.velocity * velocity
+        velocity = velocity if frames.velocity == "body" else rotation.inv().apply(velocity)
+    if angular_velocity is not None:
+        omega = axes * units.angle * angular_velocity
+        angular_velocity = (
+            omega if frames.angular_velocity == "body" else rotation.inv().apply(omega)
+        )
+    return Log(
+        time=units.time * time,
+        position=axes * units.position * position - np.asarray(frames.origin),
+        rotation=rotation,
+        velocity=velocity,
+        angular_velocity=angular_velocity,
+        command_time=units.time * command_time,
+        command=command * [units.speed, units.steering],
+    )
+
+
+def _check_finite(name: str | Path, field: str, array: np.ndarray) -> None:
+    if not len(array):
+        raise DataError(f"{name}: {field}: expected one value or more, found none")
+    bad = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(1))
+    if len(bad):
+        raise DataError(
+            f"{name}: {field}: expected finite numbers, found {array[bad[0]]} in sample {bad[0]} "
+            f"among {len(bad)} such"
+        )
+
+
+def _check_increasing(name: str | Path, field: str, stamps: np.ndarray) -> None:
+    bad = np.flatnonzero(np.diff(stamps) <= 0)
+    if len(bad):
+        sample = bad[0] + 1
+        raise DataError(
+            f"{name}: {field}: expected stamps that increase, found {stamps[sample]} after "
+            f"{stamps[sample - 1]} in sample {sample} among {len(bad)} such"
+        )
+
+
+def _check_length(name: str | Path, quaternion: np.ndarray) -> None:
+    length = np.linalg.norm(quaternion, axis=1)
+    bad = np.flatnonzero(np.abs(length - 1) > 0.01)
+    if len(bad):
+        raise DataError(
+            f"{name}: attitude: expected quaternions of length 1, found {length[bad[0]]:.4g} in "
+            f"sample {bad[0]} among {len(bad)} such"
+        )

@@ -1,0 +1,139 @@
+"""Logs at irregular moments to drives at 10 Hz."""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from vertiwm_jax.importers.log import Log
+from vertiwm_jax.importers.settings import Resampling
+from vertiwm_jax.state import STEP_SECONDS
+
+_TOLERANCE = 1e-6
+"""s; stamps since 1970 are no finer in double precision than 2.4e-7 s."""
+_EACH_SIDE = 3
+"""Poses before and after a moment that a parabola is fitted to, however few its window holds."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """T steps: state `[T + 1, 12]` and control `[T, 2]`, as in the schema of recorded drives."""
+
+    state: np.ndarray
+    control: np.ndarray
+
+
+@dataclass
+class Resampled:
+    """The drives of a log, and how many more there were, by why they were left out."""
+
+    drives: list[Drive] = field(default_factory=list)
+    left_out: Counter[str] = field(default_factory=Counter)
+
+
+def resample(log: Log, settings: Resampling, logged_point: np.ndarray) -> Resampled:
+    """The drives between the gaps of a log.
+
+    logged_point: `[3]` m, of which the log has the positions, in the body. Positions and logged
+    velocities are interpolated linearly, attitudes along the shortest rotation; a command holds
+    until the next. Velocities that were not logged are slopes of parabolas that are fitted to
+    the poses within `settings.window`.
+    """
+    found = Resampled()
+    for poses in _runs(log.time, settings.gap):
+        for commands in _runs(log.command_time, settings.command_gap):
+            last = log.time[poses][-1]
+            start = max(log.time[poses][0], log.command_time[commands][0])
+            end = min(last, log.command_time[commands][-1] + settings.command_gap)
+            if end < start:
+                continue
+            steps = int((end - start + _TOLERANCE) / STEP_SECONDS)
+            if steps < settings.shortest:
+                found.left_out[f"shorter than {settings.shortest} steps"] += 1
+                continue
+            at = np.minimum(start + STEP_SECONDS * np.arange(steps + 1), last)
+            drive = Drive(_state(log, poses, at, settings.window, logged_point), _held(log, at))
+            found.drives += _pieces(drive, settings.longest)
+    return found
+
+
+def _runs(stamps: np.ndarray, gap: float) -> Iterator[slice]:
+    """Where `[N]` stamps follow each other within `gap`."""
+    cuts = np.flatnonzero(np.diff(stamps) > gap) + 1
+    for first, end in pairwise([0, *cuts, len(stamps)]):
+        yield slice(first, end)
+
+
+def _held(log: Log, at: np.ndarray) -> np.ndarray:
+    """`[T, 2]` commands that hold at the beginning of each step between `[T + 1]` moments."""
+    latest = np.searchsorted(log.command_time, at[:-1] + _TOLERANCE, side="right") - 1
+    return log.command[latest]
+
+
+def _state(
+    log: Log, poses: slice, at: np.ndarray, window: float, logged_point: np.ndarray
+) -> np.ndarray:
+    """`[T + 1, 12]` states at `[T + 1]` moments, from poses without a gap."""
+    time, position, rotation = log.time[poses], log.position[poses], log.rotation[poses]
+    attitude = Slerp(time, rotation)(at)
+    velocity = _between(log.velocity, time, poses, at)
+    omega = _between(log.angular_velocity, time, poses, at)
+    if velocity is None or omega is None:
+        fitted = _slopes(time, position, rotation, at, attitude, window)
+        velocity = attitude.inv().apply(fitted[:, :3]) if velocity is None else velocity
+        omega = fitted[:, 3:] if omega is None else omega
+    place = np.stack([np.interp(at, time, column) for column in position.T], 1)
+    return np.concatenate(
+        [
+            place - attitude.apply(logged_point),
+            attitude.as_euler("ZYX")[:, ::-1],
+            velocity - np.cross(omega, logged_point),
+            omega,
+        ],
+        axis=1,
+    )
+
+
+def _between(
+    values: np.ndarray | None, time: np.ndarray, poses: slice, at: np.ndarray
+) -> np.ndarray | None:
+    if values is None:
+        return None
+    return np.stack([np.interp(at, time, column) for column in values[poses].T], 1)
+
+
+def _slopes(
+    time: np.ndarray,
+    position: np.ndarray,
+    rotation: Rotation,
+    at: np.ndarray,
+    attitude: Rotation,
+    window: float,
+) -> np.ndarray:
+    """`[T + 1, 6]` v_world, m/s, and omega_body, rad/s, of N poses at moments and attitudes there.
+
+    As Savitzky and Golay smooth, but over the stamps as they are: at the ends of a drive the
+    window is moved inwards. Rotations are fitted as rotation vectors from the attitude there.
+    """
+    slopes = np.empty((len(at), 6))
+    inside = np.clip(at, time[0] + window / 2, max(time[-1], time[0] + window) - window / 2)
+    first, middle, end = (np.searchsorted(time, inside + d) for d in (-window / 2, 0, window / 2))
+    first = np.minimum(first, np.maximum(middle - _EACH_SIDE, 0))
+    end = np.maximum(end, np.minimum(middle + _EACH_SIDE, len(time)))
+    for k, moment in enumerate(at):
+        near = slice(first[k], end[k])
+        turned = (attitude[k].inv() * rotation[near]).as_rotvec()
+        values = np.concatenate([position[near], turned], axis=1)
+        slopes[k] = np.polynomial.polynomial.polyfit(time[near] - moment, values, 2)[1]
+    return slopes
+
+
+def _pieces(drive: Drive, longest: int) -> Iterator[Drive]:
+    """The drive in equal pieces, each of which begins in the state that the last one ended in."""
+    steps = len(drive.control)
+    cuts = np.linspace(0, steps, -(-steps // longest) + 1).astype(int)
+    for first, end in pairwise(cuts):
+        yield Drive(drive.state[first : end + 1], drive.control[first:end])

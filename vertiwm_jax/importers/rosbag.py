@@ -1,0 +1,154 @@
+"""ROS 1 and ROS 2 bags: odometry and commands."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vertiwm_jax.importers import log
+from vertiwm_jax.importers.log import Log
+from vertiwm_jax.importers.settings import ImportSettings
+from vertiwm_jax.learning.schema import DataError
+
+_ODOMETRY = ("nav_msgs/msg/Odometry",)
+_ACKERMANN = ("ackermann_msgs/msg/AckermannDriveStamped", "ackermann_msgs/msg/AckermannDrive")
+_TWIST = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
+
+# Bags of ROS 2 up to Humble do not say what their messages hold; these are not in its base.
+_DEFINITIONS = {
+    "ackermann_msgs/msg/AckermannDrive": """
+        float32 steering_angle
+        float32 steering_angle_velocity
+        float32 speed
+        float32 acceleration
+        float32 jerk""",
+    "ackermann_msgs/msg/AckermannDriveStamped": """
+        std_msgs/Header header
+        ackermann_msgs/AckermannDrive drive""",
+    "grid_map_msgs/msg/GridMapInfo": """
+        float64 resolution
+        float64 length_x
+        float64 length_y
+        geometry_msgs/Pose pose""",
+    "grid_map_msgs/msg/GridMap": """
+        std_msgs/Header header
+        grid_map_msgs/GridMapInfo info
+        string[] layers
+        string[] basic_layers
+        std_msgs/Float32MultiArray[] data
+        uint16 outer_start_index
+        uint16 inner_start_index""",
+}
+
+
+def read(path: Path, settings: ImportSettings) -> list[Log]:
+    """The one log of a bag: a `.bag` file of ROS 1, or a folder of ROS 2.
+
+    Raises `DataError` naming bag, topic and expectation.
+    """
+    names = settings.rosbag
+    if names is None:
+        raise DataError(f"{path}: expected settings with a section `rosbag` that names its topics")
+    by_header = names.stamps == "header"
+    poses = [
+        (_stamp(received, message, by_header), *_odometry(message))
+        for received, message in messages(path, names.odometry, _ODOMETRY)
+    ]
+    commands = [
+        (_stamp(received, message, by_header), *_command(message))
+        for received, message in messages(path, names.command, (*_ACKERMANN, *_TWIST))
+    ]
+    time, position, attitude, velocity, omega = (np.array(x) for x in zip(*poses, strict=True))
+    command_time, speed, turn, is_twist = (np.array(x) for x in zip(*commands, strict=True))
+    found = log.build(
+        path,
+        settings,
+        time=time,
+        position=position,
+        attitude=attitude,
+        velocity=velocity,
+        angular_velocity=omega,
+        command_time=command_time,
+        command=np.stack([speed, turn], axis=1),
+    )
+    if is_twist[0] and names.twist == "yaw_rate":
+        found.command[:, 1] = steering(
+            found.command[:, 0], found.command[:, 1], settings.vehicle.wheelbase
+        )
+    return [found]
+
+
+def steering(speed: np.ndarray, yaw_rate: np.ndarray, wheelbase: float) -> np.ndarray:
+    """`[M]` m/s and rad/s to the `[M]` front-wheel angles, rad, that turn so without slip.
+
+    A command to stand tells no angle: the wheels stay as they were, straight at the beginning.
+    """
+    moving = speed != 0
+    angle = np.arctan(wheelbase * yaw_rate / np.where(moving, speed, 1))
+    latest = np.maximum.accumulate(np.where(moving, np.arange(len(speed)), -1))
+    return np.where(latest >= 0, angle[latest], 0)
+
+
+def messages(path: Path, topic: str, kinds: Sequence[str]) -> Iterator[tuple[int, Any]]:
+    """When each message of a topic was received, ns, and the message, of one of the types.
+
+    Raises `DataError` where the bag cannot be read, or has no such messages.
+    """
+    highlevel, typesys = _rosbags(path)
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    for kind, text in _DEFINITIONS.items():
+        store.register(typesys.get_types_from_msg(text, kind))
+    try:
+        with highlevel.AnyReader([path], default_typestore=store) as reader:
+            found = [c for c in reader.connections if c.topic == topic]
+            others = sorted({c.msgtype for c in found} - set(kinds))
+            if others or not sum(c.msgcount for c in found):
+                every = ", ".join(sorted({c.topic for c in reader.connections}))
+                raise DataError(
+                    f"{path}: {topic}: expected messages of {' or '.join(kinds)}, found "
+                    + (", ".join(others) if others else f"none; there is {every or 'nothing'}")
+                )
+            for connection, received, data in reader.messages(found):
+                yield received, reader.deserialize(data, connection.msgtype)
+    except (highlevel.AnyReaderError, OSError) as error:
+        raise DataError(f"{path}: expected a ROS bag: {error}") from None
+
+
+def _stamp(received: int, message: Any, by_header: bool) -> float:
+    """s."""
+    if by_header and hasattr(message, "header"):
+        stamp = message.header.stamp
+        return stamp.sec + 1e-9 * stamp.nanosec
+    return 1e-9 * received
+
+
+def _odometry(message: Any) -> tuple[list[float], ...]:
+    """Position, quaternion, linear and angular velocity."""
+    pose, twist = message.pose.pose, message.twist.twist
+    q = pose.orientation
+    return (_xyz(pose.position), [q.x, q.y, q.z, q.w], _xyz(twist.linear), _xyz(twist.angular))
+
+
+def _command(message: Any) -> tuple[float, float, bool]:
+    """Speed, what turns, and whether that is of a Twist."""
+    if message.__msgtype__ in _ACKERMANN:
+        drive = getattr(message, "drive", message)
+        return drive.speed, drive.steering_angle, False
+    twist = getattr(message, "twist", message)
+    return twist.linear.x, twist.angular.z, True
+
+
+def _xyz(vector: Any) -> list[float]:
+    return [vector.x, vector.y, vector.z]
+
+
+def _rosbags(path: Path) -> tuple[Any, Any]:
+    try:
+        from rosbags import highlevel, typesys
+    except ImportError:
+        raise DataError(
+            f"{path}: expected the package rosbags to read bags, it is not installed; "
+            "pip install 'vertiwm-jax[logs]'"
+        ) from None
+    return highlevel, typesys

@@ -1,0 +1,134 @@
+"""CSV and Parquet: a row a moment, columns as the settings name them."""
+
+import csv
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from vertiwm_jax.importers import log
+from vertiwm_jax.importers.log import Log
+from vertiwm_jax.importers.settings import ImportSettings, Table
+from vertiwm_jax.learning.schema import DataError
+
+Columns = dict[str, np.ndarray]
+
+
+def read_csv(path: Path, settings: ImportSettings) -> list[Log]:
+    """The drives of a CSV file with a head, in the order in which they begin.
+
+    Raises `DataError` naming file, column and expectation.
+    """
+    return _read(path, settings, _csv_columns)
+
+
+def read_parquet(path: Path, settings: ImportSettings) -> list[Log]:
+    """The same of a Parquet file; needs pyarrow."""
+    return _read(path, settings, _parquet_columns)
+
+
+def _read(
+    path: Path, settings: ImportSettings, columns_of: Callable[[Path, list[str]], Columns]
+) -> list[Log]:
+    table = settings.table
+    if table is None:
+        raise DataError(f"{path}: expected settings with a section `table` that names its columns")
+    columns = columns_of(path, _names(table))
+    if table.drive is None:
+        return [_log(str(path), columns, table, settings)]
+    drives = columns.pop(table.drive).astype(str)
+    labels, first = np.unique(drives, return_index=True)
+    return [
+        _log(
+            f"{path}: drive {label}",
+            {name: column[drives == label] for name, column in columns.items()},
+            table,
+            settings,
+        )
+        for label in labels[np.argsort(first)]
+    ]
+
+
+def _names(table: Table) -> list[str]:
+    """All columns that are read."""
+    groups = (table.position, table.rpy, table.quaternion, table.velocity, table.angular_velocity)
+    single = (table.time, table.speed, table.steering, table.brake, table.drive)
+    names = [name for group in groups for name in group or ()] + [name for name in single if name]
+    return list(dict.fromkeys(names))
+
+
+def _log(name: str, columns: Columns, table: Table, settings: ImportSettings) -> Log:
+    numbers = {key: _numbers(name, key, column) for key, column in columns.items()}
+
+    def stacked(names: Sequence[str]) -> np.ndarray:
+        return np.stack([numbers[key] for key in names], axis=1)
+
+    speed = numbers[table.speed]
+    if table.brake is not None:
+        speed = speed - numbers[table.brake]
+    return log.build(
+        name,
+        settings,
+        time=numbers[table.time],
+        position=stacked(table.position),
+        attitude=stacked(table.quaternion or table.rpy or ()),
+        velocity=stacked(table.velocity) if table.velocity else None,
+        angular_velocity=stacked(table.angular_velocity) if table.angular_velocity else None,
+        command_time=numbers[table.time],
+        command=np.stack([speed, numbers[table.steering]], axis=1),
+    )
+
+
+def _numbers(name: str, key: str, column: np.ndarray) -> np.ndarray:
+    try:
+        return column.astype(np.float64)
+    except (ValueError, TypeError) as error:
+        raise DataError(f"{name}: {key}: expected numbers: {error}") from None
+
+
+def _csv_columns(path: Path, names: Sequence[str]) -> Columns:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.reader(file, skipinitialspace=True)
+            head = next(rows, [])
+            _check_head(path, names, head)
+            places = [head.index(name) for name in names]
+            cells = []
+            for row in rows:
+                if len(row) != len(head):
+                    raise DataError(
+                        f"{path}: line {rows.line_num}: expected {len(head)} values as in the "
+                        f"head, found {len(row)}"
+                    )
+                cells.append([row[place] for place in places])
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"{path}: expected a CSV file in UTF-8: {error}") from None
+    if not cells:
+        raise DataError(f"{path}: expected rows below the head, found none")
+    return dict(zip(names, np.array(cells).T, strict=True))
+
+
+def _parquet_columns(path: Path, names: Sequence[str]) -> Columns:
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        raise DataError(
+            f"{path}: expected the package pyarrow to read Parquet, it is not installed; "
+            "pip install 'vertiwm-jax[logs]'"
+        ) from None
+    try:
+        file = parquet.ParquetFile(path)
+        _check_head(path, names, file.schema_arrow.names)
+        table = file.read(columns=list(names))
+    except pyarrow.ArrowException as error:
+        raise DataError(f"{path}: expected a Parquet file: {error}") from None
+    return {name: table[name].to_numpy() for name in names}
+
+
+def _check_head(path: Path, names: Sequence[str], head: Sequence[str]) -> None:
+    missing = [name for name in names if name not in head]
+    if missing:
+        raise DataError(
+            f"{path}: expected columns {', '.join(missing)}, found only {', '.join(head)}"
+        )
