@@ -7,10 +7,11 @@ import pytest
 from vertiwm_jax import config, evaluate
 from vertiwm_jax.compare import CompareConfig
 from vertiwm_jax.fit import FitConfig
+from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.ppo import PPOTraining
 
 FOLDER = Path(__file__).parents[1] / "configs"
-KINDS = {"table3": CompareConfig} | dict.fromkeys(
+KINDS = {"table3": CompareConfig, "import_nedm": ImportSettings} | dict.fromkeys(
     ["fit_chrono", "fit_paper", "fine_tune"], FitConfig
 )
 

@@ -16,7 +16,7 @@ _ACKERMANN = ("ackermann_msgs/msg/AckermannDriveStamped", "ackermann_msgs/msg/Ac
 _TWIST = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
 
 # Bags of ROS 2 up to Humble do not say what their messages hold; these are not in its base.
-_DEFINITIONS = {
+DEFINITIONS = {
     "ackermann_msgs/msg/AckermannDrive": """
         float32 steering_angle
         float32 steering_angle_velocity
@@ -97,7 +97,7 @@ def messages(path: Path, topic: str, kinds: Sequence[str]) -> Iterator[tuple[int
     """
     highlevel, typesys = _rosbags(path)
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    for kind, text in _DEFINITIONS.items():
+    for kind, text in DEFINITIONS.items():
         store.register(typesys.get_types_from_msg(text, kind))
     try:
         with highlevel.AnyReader([path], default_typestore=store) as reader:
