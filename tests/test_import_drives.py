@@ -1,7 +1,6 @@
 """Logs become a collection that fitting and testing read: the command."""
 
 import csv
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,14 @@ from importers.bags import Bag
 from importers.logged import SETTINGS, VEHICLE, errors, logged, rms, terrain
 
 from vertiwm_jax import config, import_drives
-from vertiwm_jax.importers.settings import GridMapSettings, Resampling, Table, Topics
+from vertiwm_jax.importers.settings import (
+    Frames,
+    GridMapSettings,
+    ImportSettings,
+    Resampling,
+    Table,
+    Topics,
+)
 from vertiwm_jax.learning import dataset, schema, windows
 from vertiwm_jax.terrain import files
 
@@ -61,7 +67,7 @@ def run(*argv):
 
 
 def test_a_log_becomes_a_collection(folder, seen, tmp_path, capsys):
-    run(*arguments(folder, tmp_path / "drives"), "--map", folder / "level.npz")
+    run(*arguments(folder, tmp_path / "drives"), "--map", folder / "level.npz", "--format", "csv")
     out = capsys.readouterr().out
     assert f"{folder}/loops.csv" in out
     assert "| velocity, angular velocity | 26 | 1,004 | - |" in out
@@ -82,7 +88,7 @@ def test_a_log_becomes_a_collection(folder, seen, tmp_path, capsys):
     assert cut.state.shape[1:] == (17, 12) and np.isfinite(cut.state).all()
     _, meta = schema.read(tmp_path / "drives" / "drives_000.npz")
     assert meta["vehicle"]["wheels_in_body_xy"] == VEHICLE.wheels_in_body_xy
-    assert meta["sources"] == [str(folder / "loops.csv")]
+    assert meta["map"] == "map.npz" and meta["sources"] == [str(folder / "loops.csv")]
 
 
 def test_a_bag_brings_its_own_ground(seen, tmp_path, capsys):
@@ -109,15 +115,33 @@ def test_a_bag_brings_its_own_ground(seen, tmp_path, capsys):
 
 
 def test_what_was_left_out_is_told(folder, seen, tmp_path, capsys):
-    holed = replace(seen, position=seen.position + 15.0 * np.eye(3)[0])
-    write_csv(tmp_path / "far.csv", holed)
-    (tmp_path / "settings.yaml").write_text((folder / "settings.yaml").read_text())
-    run(*arguments(tmp_path, tmp_path / "drives", "far.csv"), "--map", folder / "level.npz")
+    write_csv(folder / "far.csv", replace(seen, position=seen.position + 15.0 * np.eye(3)[0]))
+    run(*arguments(folder, tmp_path / "drives", "far.csv"), "--map", folder / "level.npz")
     out = capsys.readouterr().out
     drives, _ = dataset.load(tmp_path / "drives", "train")
     # x = 15 + 20 sin(0.15 t) is beyond 30 m while the sine is above 0.75.
     assert " off the map |" in out
     assert np.asarray(drives.state)[..., 0].max() <= 30
+
+
+def test_velocities_of_another_frame_are_told_apart(folder, seen, tmp_path):
+    """Velocities in the world that are declared to be the body's."""
+    world = seen.rotation.apply(seen.state[:, 6:9])
+    columns = {f"v{axis}": world[:, i] for i, axis in enumerate("xyz")}
+    write_csv(folder / "world.csv", seen, **columns)
+    settings = config.load(ImportSettings, folder / "settings.yaml")
+    assert settings.table is not None
+    named = replace(settings, table=replace(settings.table, velocity=("vx", "vy", "vz")))
+    config.save(named, folder / "body.yaml")
+    argv = (*arguments(folder, tmp_path / "drives", "world.csv", "body.yaml"), "--map")
+    message = refusal(import_drives.main, *argv, folder / "level.npz")
+    assert "world.csv: velocity: expected to point where the positions go, found" in message
+    config.save(replace(named, frames=Frames(velocity="world")), folder / "body.yaml")
+    run(*argv, folder / "level.npz")
+    drives, _ = dataset.load(tmp_path / "drives", "train")
+    at = seen.time[0] + 0.1 * np.arange(drives.length[0] + 1)
+    error = errors(np.asarray(drives.state[0])[: len(at)], at)
+    assert np.abs(error[:, 6:9]).max() < 0.03
 
 
 def test_refusals_are_one_line_and_leave_nothing(folder, seen, tmp_path):
@@ -151,6 +175,9 @@ def test_refusals_are_one_line_and_leave_nothing(folder, seen, tmp_path):
     write_csv(folder / "few.csv", replace(seen, **few))
     short = message(*arguments(folder, output, "few.csv"), *with_map)
     assert short.endswith("found none: 1 shorter than 20 steps")
+    with pytest.raises(SystemExit) as stop:
+        run("--output", output, "--settings", folder / "settings.yaml")
+    assert stop.value.code == 2
     output.mkdir()
     assert "expected no such folder yet" in refusal(
         import_drives.main, *arguments(folder, output), *with_map
@@ -165,10 +192,3 @@ def test_stopping_leaves_nothing(folder, tmp_path, monkeypatch):
     with pytest.raises(SystemExit) as stopped:
         run(*arguments(folder, tmp_path / "drives"), "--map", folder / "level.npz")
     assert stopped.value.code == 130 and not list(tmp_path.iterdir())
-
-
-def test_the_map_is_named_in_the_meta(folder, tmp_path):
-    run(*arguments(folder, tmp_path / "drives"), "--map", folder / "level.npz", "--format", "csv")
-    with np.load(tmp_path / "drives" / "drives_001.npz") as archive:
-        assert json.loads(str(archive["meta"]))["map"] == "map.npz"
-        assert archive["length"].tolist() == [39]

@@ -39,6 +39,10 @@ ENDINGS: dict[str, Format] = {
 }
 
 
+LARGEST_ANGLE = np.radians(20)
+"""Between velocity and motion, in the median: another frame, or w before x, lie beyond."""
+
+
 @dataclass(frozen=True)
 class ImportDrives:
     """Bring logged drives into the form that `fit` and `evaluate` read, at 10 Hz."""
@@ -53,6 +57,10 @@ class ImportDrives:
     """What the logs are; by default as their names end."""
     map: Path | None = None
     """The ground, an .npz map; by default that of a bag's GridMap topic."""
+
+    def __post_init__(self):
+        if not self.sources:
+            raise ValueError("sources: expected a log or more, found none")
 
 
 @dataclass(frozen=True)
@@ -136,13 +144,12 @@ def _import(
 ) -> Imported:
     """The drives of all logs of a source that are on the map."""
     drives, left_out = [], Counter[str]()
+    point = np.asarray(settings.vehicle.logged_point)
     for log in logs:
-        found = resampling.resample(
-            log, settings.resampling, np.asarray(settings.vehicle.logged_point)
-        )
+        found = resampling.resample(log, settings.resampling, point)
         left_out += found.left_out
         if found.drives:
-            schema.check(source, collection.arrays(found.drives))
+            _check(source, found.drives)
         kept = [drive for drive in found.drives if collection.on_map(terrain, drive)]
         left_out["off the map"] += len(found.drives) - len(kept)
         drives += kept
@@ -151,10 +158,22 @@ def _import(
     return Imported(
         source=source,
         drives=drives,
-        poses_per_second=float(np.median([1 / np.median(np.diff(log.time)) for log in logs])),
+        poses_per_second=float(1 / np.median(np.concatenate([np.diff(log.time) for log in logs]))),
         derived=tuple(name for name, logged in derived.items() if logged is None),
         left_out=+left_out,
     )
+
+
+def _check(source: Path, drives: Sequence[Drive]) -> None:
+    """Raises `DataError` unless the drives are of the schema, and move where they say."""
+    schema.check(source, collection.arrays(drives))
+    way_off, _ = resampling.directions(drives)
+    if way_off > LARGEST_ANGLE:
+        raise DataError(
+            f"{source}: velocity: expected to point where the positions go, found "
+            f"{np.degrees(way_off):.0f} degrees off in half of the steps; see `frames` of the "
+            "settings, and the order of quaternions"
+        )
 
 
 def _table(imported: Sequence[Imported]) -> list[str]:
@@ -177,9 +196,12 @@ def _reasons(each: Imported) -> str:
 
 def _remarks(drives: Sequence[Drive], terrain: TerrainMap) -> list[str]:
     low, middle, high = collection.clearance(terrain, drives)
+    _, axis_off = resampling.directions(drives)
     lines = [
         f"the body origin is {middle:.2f} m above the map, half of the time within {low:.2f} and "
-        f"{high:.2f}: expected is about the radius of a wheel"
+        f"{high:.2f}: expected is about the radius of a wheel",
+        f"the vehicle moves {np.degrees(axis_off):.1f} degrees off its x axis, in the median: "
+        "expected are a few",
     ]
     lacking = [split for split, indices in SPLITS.items() if len(drives) <= indices.start]
     if lacking:

@@ -139,7 +139,9 @@ class Bag:
         header = self.header(stamp)
         pose = self.pose([*centre, 0], [0, 0, 0, 1])
         lengths = (resolution, rows * resolution, columns * resolution, pose)
-        info = self.make("grid_map_msgs/msg/GridMapInfo", *([header] if self._is1 else []), *lengths)
+        info = self.make(
+            "grid_map_msgs/msg/GridMapInfo", *([header] if self._is1 else []), *lengths
+        )
         values = (info, list(layers), [], data, *start)
         message = self.make("grid_map_msgs/msg/GridMap", *([] if self._is1 else [header]), *values)
         self.write("/map", stamp, message)

@@ -98,5 +98,5 @@ def test_maps_that_cannot_be_used_are_named(tmp_path):
     lifted = Frames(origin=(0.0, 0.0, 8.0))
     with pytest.raises(MapError, match="elevation_range"):
         grid_map.terrain([tmp_path / "c"], LAYERS, lifted)
-    with pytest.raises(ValueError, match="ground: expected one of clay, .*, found lava"):
+    with pytest.raises(ValueError, match=r"ground: expected one of clay, .*, found lava"):
         GridMapSettings("/map", ground="lava")

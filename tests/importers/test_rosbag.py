@@ -54,7 +54,9 @@ def test_a_twist_turns_by_its_yaw_rate(bag):
     # The bicycle without slip: yaw rate = v tan(angle) / wheelbase.
     turn = speed * np.tan(angle) / VEHICLE.wheelbase
     np.testing.assert_allclose(np.stack([speed, turn], 1), commands(COMMAND_TIME))
-    angles = replace(TWIST, rosbag=replace(TWIST.rosbag, twist="steering"), units=Units(steering=-2))
+    angles = replace(
+        TWIST, rosbag=replace(TWIST.rosbag, twist="steering"), units=Units(steering=-2)
+    )
     (log,) = rosbag.read(bag, angles)
     np.testing.assert_allclose(log.command, commands(COMMAND_TIME) * [1, -2])
 

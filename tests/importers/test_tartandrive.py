@@ -125,7 +125,7 @@ def test_what_cannot_be_used_is_named(seen, tmp_path):
     holed = state(seen, 13)
     holed[4] = np.inf
     path = folder(tmp_path / "holed", seen, state=(seen.time, holed))
-    with pytest.raises(DataError, match="position: expected finite numbers, found .* in sample 4"):
+    with pytest.raises(DataError, match=r"position: expected finite numbers, found .* in sample 4"):
         tartandrive.read(path, SETTINGS)
     np.savez(tmp_path / "a.npz", observation=np.array({"state": 0}))
     with pytest.raises(DataError, match=r"a.npz: expected a .pt trajectory"):

@@ -44,7 +44,7 @@ def build(
     time: `[N]`; position: `[N, 3]`; attitude: `[N, 3]` roll, pitch, yaw or `[N, 4]` quaternions
     x, y, z, w; velocity, angular_velocity: `[N, 3]`; command_time: `[M]`; command: `[M, 2]` speed
     and steering. Raises `DataError`, which calls the log `name`, unless all are finite, stamps
-    increase and quaternions have length 1.
+    increase, quaternions have length 1 and there are two poses.
     """
     arrays = {
         "time": time,
@@ -58,6 +58,8 @@ def build(
     for field, array in arrays.items():
         if array is not None:
             _check_finite(name, field, array)
+    if len(time) < 2:
+        raise DataError(f"{name}: time: expected two poses or more, found one")
     _check_increasing(name, "time", time)
     _check_increasing(name, "time of commands", command_time)
     units, frames = settings.units, settings.frames

@@ -1,7 +1,7 @@
 """Logs at irregular moments to drives at 10 Hz."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -58,6 +58,25 @@ def resample(log: Log, settings: Resampling, logged_point: np.ndarray) -> Resamp
             drive = Drive(_state(log, poses, at, settings.window, logged_point), _held(log, at))
             found.drives += _pieces(drive, settings.longest)
     return found
+
+
+def directions(drives: Sequence[Drive]) -> tuple[float, float]:
+    """Median angles, rad, over the steps at 1 m/s or more; NaN if there are none.
+
+    That between the velocity and the way that the step goes, and that between the velocity and
+    the axis along which the vehicle drives.
+    """
+    state = np.concatenate([drive.state[:-1] for drive in drives])
+    moved = np.concatenate([np.diff(drive.state[:, :3], axis=0) for drive in drives])
+    moving = np.linalg.norm(state[:, 6:9], axis=1) > 1
+    if not moving.any():
+        return np.nan, np.nan
+    velocity, attitude = state[moving, 6:9], Rotation.from_euler("ZYX", state[moving, 5:2:-1])
+    ahead = np.abs(velocity[:, 0]) / np.linalg.norm(velocity, axis=1)
+    way = attitude.inv().apply(moved[moving])
+    along = (way * velocity).sum(1) / np.linalg.norm(way, axis=1) / np.linalg.norm(velocity, axis=1)
+    way_off, axis_off = (np.median(np.arccos(np.clip(c, -1, 1))) for c in (along, ahead))
+    return float(way_off), float(axis_off)
 
 
 def _runs(stamps: np.ndarray, gap: float) -> Iterator[slice]:
