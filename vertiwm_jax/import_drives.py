@@ -201,7 +201,7 @@ def _remarks(drives: Sequence[Drive], terrain: TerrainMap) -> list[str]:
         f"the body origin is {middle:.2f} m above the map, half of the time within {low:.2f} and "
         f"{high:.2f}: expected is about the radius of a wheel",
         f"the vehicle moves {np.degrees(axis_off):.1f} degrees off its x axis, in the median: "
-        "expected are a few",
+        "more than 20 hint at another frame",
     ]
     lacking = [split for split, indices in SPLITS.items() if len(drives) <= indices.start]
     if lacking:
