@@ -1,6 +1,7 @@
 """Bags of ROS 1 and ROS 2."""
 
 import sqlite3
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -109,8 +110,19 @@ def test_bags_that_cannot_be_used_are_named(bag, seen, tmp_path):
     assert message(broken, ACKERMANN).startswith("expected a ROS bag: ")
     (tmp_path / "empty").mkdir()
     assert message(tmp_path / "empty", ACKERMANN).startswith("expected a ROS bag: ")
+    with Bag(tmp_path / "torn") as writer:
+        writer.odometry(seen)
+    (database,) = (tmp_path / "torn").glob("*.db3")
+    database.write_bytes(b"SQLite format 3" + bytes(200))
+    assert message(tmp_path / "torn", ACKERMANN).startswith("expected a ROS bag: ")
     repeated = np.where(np.arange(len(seen.time)) == 6, seen.time[5], seen.time)
     with Bag(tmp_path / "mixed.bag") as writer:
         writer.odometry(replace(seen, time=repeated))
         writer.ackermann(COMMAND_TIME, commands(COMMAND_TIME))
     assert message(tmp_path / "mixed.bag", ACKERMANN).startswith("time: expected stamps that incr")
+
+
+def test_bags_need_a_package(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(DataError, match=r"package rosbags .* pip install 'vertiwm-jax\[logs\]'"):
+        rosbag.read(tmp_path / "a.bag", ACKERMANN)

@@ -1,6 +1,7 @@
 """CSV and Parquet, a row a moment."""
 
 import csv
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -128,3 +129,9 @@ def test_attitudes_are_told_once():
     for attitudes in ({}, {"rpy": ("a", "b", "c"), "quaternion": ("a", "b", "c", "d")}):
         with pytest.raises(ValueError, match="rpy, quaternion: expected one of them"):
             Table("t", ("x", "y", "z"), "speed", "steer", **attitudes)
+
+
+def test_parquet_needs_a_package(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(DataError, match=r"package pyarrow .* pip install 'vertiwm-jax\[logs\]'"):
+        table.read_parquet(tmp_path / "a.parquet", CSV)

@@ -1,6 +1,7 @@
 """ROS 1 and ROS 2 bags: odometry and commands."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,9 +74,8 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
         command=np.stack([speed, turn], axis=1),
     )
     if is_twist[0] and names.twist == "yaw_rate":
-        found.command[:, 1] = steering(
-            found.command[:, 0], found.command[:, 1], settings.vehicle.wheelbase
-        )
+        angle = steering(found.command[:, 0], found.command[:, 1], settings.vehicle.wheelbase)
+        found = replace(found, command=np.stack([found.command[:, 0], angle], axis=1))
     return [found]
 
 
