@@ -79,7 +79,7 @@ def load(folders: str | Path | Sequence[str | Path], split: Split) -> tuple[Driv
         if not found:
             raise DataError(f"{folder}: expected a folder with .npz files of drives, found none")
         for path in found:
-            arrays, terrain = _load_file(path)
+            arrays, terrain = _read(path)
             chosen = [i for i in SPLITS[split] if i < len(arrays["length"])]
             picked = {name: array[chosen] for name, array in arrays.items()}
             parts.append({**picked, "world": np.full(len(chosen), len(maps), np.int32)})
@@ -92,6 +92,13 @@ def load(folders: str | Path | Sequence[str | Path], split: Split) -> tuple[Driv
             )
         paths += found
     return _join(paths, parts), stack(maps, [f"map of {path}" for path in paths])
+
+
+def load_file(path: Path) -> tuple[Drives, TerrainMap]:
+    """All drives of one file, with its map; raises like `load`."""
+    arrays, terrain = _read(path)
+    world = np.zeros(len(arrays["length"]), np.int32)
+    return _join([path], [{**arrays, "world": world}]), terrain
 
 
 def split_worlds(drives: Drives, every: int) -> tuple[Drives, Drives]:
@@ -108,7 +115,7 @@ def split_worlds(drives: Drives, every: int) -> tuple[Drives, Drives]:
     return kept, left
 
 
-def _load_file(path: Path) -> tuple[dict[str, np.ndarray], TerrainMap]:
+def _read(path: Path) -> tuple[dict[str, np.ndarray], TerrainMap]:
     """The arrays of all drives of a file and its map."""
     arrays, meta = schema.read(path)
     terrain = files.load(schema.find_map(path, meta["map"]))

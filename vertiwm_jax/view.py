@@ -1,0 +1,132 @@
+"""`python -m vertiwm_jax.view`: a drive in three dimensions and over time, or as a movie."""
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import tyro
+
+from vertiwm_jax import policy_training, runs
+from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.config import ConfigError
+from vertiwm_jax.evaluate import training
+from vertiwm_jax.rl import ground, task
+from vertiwm_jax.rl.ground import Suite
+from vertiwm_jax.runs import RunError
+from vertiwm_jax.viewing import driven, movie, recorded, recording
+from vertiwm_jax.viewing.scene import Scene
+from vertiwm_jax.world_model.choice import ModelName, choose
+
+
+@dataclass(frozen=True)
+class View:
+    """Show how a policy drives a task, or a recorded drive with what a model predicts of it."""
+
+    source: tyro.conf.Positional[Path]
+    """Run folder of a policy's training, or an .npz file of recorded drives."""
+    model: ModelName = "vertiwm"
+    """What a policy drives in, or whose predictions are shown beside a recorded drive."""
+    weights: Path | None = None
+    """Folder of a fitted model, instead of the one that comes with the package."""
+    suite: Suite | None = None
+    """Kind of procedural worlds to drive a policy on; all that were held out by default."""
+    task: int | None = None
+    """Which of the tasks there; the first by default."""
+    seed: int | None = None
+    """Which of the policies that the run trained side by side; the first by default."""
+    drive: int | None = None
+    """Which drive of a file; the first by default."""
+    output: Path | None = None
+    """File of the recording; beside what is shown by default."""
+    open: bool = False
+    """Whether to open the recording in the rerun viewer."""
+    movie: Path | None = None
+    """A .gif or .mp4 file to write instead of a recording."""
+
+    def __post_init__(self):
+        if self.movie and self.movie.suffix not in movie.WRITERS:
+            found = self.movie.suffix or "none"
+            raise ValueError(f"movie: expected the ending .gif or .mp4, found {found}")
+        if self.movie and (self.output or self.open):
+            raise ValueError("movie: is written instead of a recording, leave out output and open")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; expected failures end in one line and a status that is not 0."""
+    command = tyro.cli(View, args=argv, prog="python -m vertiwm_jax.view")
+    try:
+        path = view(command)
+    except (RunError, CheckpointError, ConfigError, OSError) as error:
+        sys.exit(f"error: {error}")
+    if command.movie:
+        print(f"the movie is {path}")
+        return
+    print(f"the recording is {path}; to look at it:\nrerun {path}")
+    if command.open:
+        status = subprocess.call([sys.executable, "-m", "rerun", str(path)])
+        if status:
+            sys.exit(f"error: {path}: the rerun viewer ended with status {status}")
+
+
+def view(command: View) -> Path:
+    """Writes what was asked for, as a whole or not at all; the file."""
+    show = _driven if command.source.is_dir() else _recorded
+    try:
+        scene, beside = show(command)
+    except ValueError as error:  # what is wrong with drives, maps, or tasks on them
+        sys.exit(f"error: {error}")
+    print(scene.title, flush=True)
+    path = command.movie or command.output or beside
+    write = movie.write if command.movie else recording.write
+    with tempfile.TemporaryDirectory() as folder:
+        unfinished = Path(folder) / path.name
+        write(scene, unfinished)
+        runs.write_atomic(path, unfinished.read_bytes())
+    return path
+
+
+def _driven(command: View) -> tuple[Scene, Path]:
+    """The policy of a run on its task, and where the recording goes by default."""
+    run, number, seed = command.source, command.task or 0, command.seed or 0
+    if command.drive is not None:
+        raise ConfigError(f"{run}: drive: is of a file of drives, found the folder of a run")
+    config = replace(training(run / "config.yaml"), planning=None)
+    if command.suite:
+        config = replace(config, worlds=None)
+        config = replace(config, ground=replace(config.ground, suites=(command.suite,)))
+    if command.weights:
+        config = replace(config, weights=command.weights)
+    terrain = task.held_out(config)
+    policies = policy_training.learned(config, terrain, run)
+    pool = ground.test_tasks(config.ground, terrain)
+    for name, found, count in (("task", number, len(pool.world)), ("seed", seed, len(policies))):
+        if not 0 <= found < count:
+            raise ConfigError(f"{run}: {name}: expected 0 to {count - 1}, found {found}")
+    alone = jax.tree.map(lambda x: x[number : number + 1], pool)
+    test = task.environment(config, command.model, terrain, alone)
+    name, policy = list(policies.items())[seed]
+    where = f"{command.suite or 'held-out'}-{number}-{command.model}"
+    title = f"{name} in {command.model}"
+    scene = driven.drive(test.env, test.params, policy, config.key("testing"), title)
+    return scene, run / f"{where}.rrd"
+
+
+def _recorded(command: View) -> tuple[Scene, Path]:
+    """The drive of a file beside a model's predictions, and where the recording goes by default."""
+    file, number = command.source, command.drive or 0
+    for name in ("suite", "task", "seed"):
+        if getattr(command, name) is not None:
+            raise ConfigError(
+                f"{file}: {name}: is of a policy, expected the folder of a run, found none"
+            )
+    model = choose(command.model, command.weights)
+    scene = recorded.load(file, number, command.model, *model)
+    return scene, file.with_name(f"{file.stem}-drive-{number}.rrd")
+
+
+if __name__ == "__main__":
+    main()

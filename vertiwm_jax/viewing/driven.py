@@ -1,0 +1,83 @@
+"""A policy's drive through one task as a scene."""
+
+from functools import partial
+
+import jax
+import numpy as np
+
+from vertiwm_jax.env.driver import Driver, Memory, Policy, Reactive
+from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
+from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.evaluation.wheels import modelled
+from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.viewing.scene import Scene
+
+
+def drive(
+    env: NavigationEnv,
+    params: NavigationParams,
+    policy: Policy | Driver,
+    key: jax.Array,
+    name: str,
+) -> Scene:
+    """Drives the first task of the pool to its end; `name` is that of the policy, for the title."""
+    driver = policy if isinstance(policy, Driver) else Reactive(policy)
+    observation, state = env.start(params, jax.numpy.int32(0))
+    memory = driver.start(params, state)
+    rows = [_row(env, state)]
+    for step in range(int(params.max_steps_in_episode)):
+        if state.ending != Ending.RUNNING:
+            break
+        keys = jax.random.split(jax.random.fold_in(key, step), 3)
+        if step % driver.interval == 0:
+            memory = _decide(driver, params, memory, observation, state, keys[0])
+        memory, observation, state = _advance(
+            env, driver, params, memory, observation, state, keys[1:]
+        )
+        rows.append(_row(env, state))
+    vehicle, command, wheels, alpha = jax.tree.map(lambda *x: np.stack(x), *rows)
+    ending = Ending(int(state.ending)).name.lower().replace("_", " ")
+    return Scene(
+        title=f"{name}: {ending}, {STEP_SECONDS * int(state.time):.1f} s",
+        terrain=params.terrain.select(state.world),
+        state=vehicle,
+        command=command[1:],
+        wheels=wheels,
+        coefficients=alpha,
+        goal=np.asarray(state.goal),
+        goal_radius=env.config.goal_radius,
+    )
+
+
+def _row(env: NavigationEnv, state: NavigationState) -> tuple:
+    """What is kept of a step: the state, the command that led there, wheels and coefficients."""
+    command = env.config.command(state.action).vector
+    alpha = getattr(state.history, "coefficients", None)
+    return jax.device_get((state.vehicle.vector, command, modelled(state.history), alpha))
+
+
+@jax.jit
+def _decide(
+    driver: Driver,
+    params: NavigationParams,
+    memory: Memory,
+    observation: jax.Array,
+    state: NavigationState,
+    key: jax.Array,
+) -> Memory:
+    return driver.decide(params, memory, observation, state, key)
+
+
+@partial(jax.jit, static_argnames="env")
+def _advance(
+    env: NavigationEnv,
+    driver: Driver,
+    params: NavigationParams,
+    memory: Memory,
+    observation: jax.Array,
+    state: NavigationState,
+    keys: jax.Array,
+) -> tuple[Memory, jax.Array, NavigationState]:
+    action, memory = driver.act(params, memory, observation, state, keys[0])
+    observation, state, *_ = env.step_env(keys[1], state, action, params)
+    return memory, observation, state

@@ -1,0 +1,79 @@
+"""Recorded drives as scenes, with what a model predicts of them."""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from vertiwm_jax.dynamics import Dynamics, History, Params
+from vertiwm_jax.evaluation import wheels
+from vertiwm_jax.evaluation.prediction import BATCH
+from vertiwm_jax.learning import dataset, windows
+from vertiwm_jax.learning.dataset import Drives
+from vertiwm_jax.learning.rollouts import open_loop
+from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.learning.windows import Windows
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.viewing.scene import Prediction, Scene
+
+STEPS = 16
+"""Of a prediction, and of the recorded drive that the model sees before it, as in the tables."""
+
+
+def load(path: Path, drive: int, name: str, dynamics: Dynamics, params: Params) -> Scene:
+    """A drive of a file, by number, and what the model, called `name`, predicts every 16 steps.
+
+    Raises `DataError` or `MapError` on a file that cannot be used, that has no such drive, or of
+    which it is too short to predict anything.
+    """
+    drives, terrain = dataset.load_file(path)
+    count = len(drives.length)
+    if not 0 <= drive < count:
+        raise DataError(f"{path}: drive: expected 0 to {count - 1}, found {drive}")
+    length = int(drives.length[drive])
+    if length < 2 * STEPS:
+        raise DataError(
+            f"{path}: drive {drive}: expected at least {2 * STEPS} steps, found {length}"
+        )
+    alone: Drives = jax.tree.map(lambda x: np.asarray(x)[drive : drive + 1], drives)
+    return Scene(
+        title=f"{path.stem}, drive {drive}, and {name}",
+        terrain=terrain,
+        state=np.asarray(alone.state)[0, : length + 1],
+        command=np.asarray(alone.control)[0, :length],
+        wheels=jax.tree.map(lambda x: x[0, : length + 1], alone.auxiliary),
+        prediction=predict(dynamics, params, terrain, alone),
+    )
+
+
+def predict(dynamics: Dynamics, params: Params, terrain: TerrainMap, drive: Drives) -> Prediction:
+    """What the model predicts every 16 steps of one drive, D = 1, of 32 steps or more."""
+    index = windows.index(drive, terrain, STEPS, STEPS, STEPS)
+    shown = replace(windows.gather(drive, index), auxiliary=dataset.Auxiliary())
+    found = _predict(dynamics, params, terrain, shown)
+    states, alpha, depth = jax.device_get(found)
+    first = np.asarray(shown.state)[:, STEPS]
+    return Prediction(
+        start=np.asarray(index.start) + STEPS,
+        state=np.concatenate([first[:, None], states], axis=1),
+        coefficients=alpha,
+        sinkage=depth,
+    )
+
+
+def alpha_and_sinkage(history: History) -> tuple[jax.Array | None, dataset.Array | None]:
+    """`[4]` each, of a model that has them: fusion coefficients, and m of the wheels."""
+    modelled = wheels.modelled(history)
+    return getattr(history, "coefficients", None), modelled and modelled.wheel_sinkage
+
+
+@partial(jax.jit, static_argnames="dynamics")
+def _predict(dynamics: Dynamics, params: Params, terrain: TerrainMap, shown: Windows):
+    def one(window: Windows):
+        world = terrain.select(window.world)
+        states, read = open_loop(dynamics, params, world, window, alpha_and_sinkage)
+        return states.vector, *read
+
+    return jax.lax.map(one, shown, batch_size=BATCH)

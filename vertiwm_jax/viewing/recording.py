@@ -1,0 +1,217 @@
+"""A scene as a recording for the rerun viewer: a world in three dimensions, and plots over time."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+
+from vertiwm_jax import geometry
+from vertiwm_jax.config import ConfigError
+from vertiwm_jax.env import picture
+from vertiwm_jax.evaluation import plots
+from vertiwm_jax.terrain import query
+from vertiwm_jax.viewing.scene import WHEELS, Scene, panels
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+DRIVEN, PREDICTED = (plots.line(i)[0] for i in (0, 1))
+_TYRE, _SPOKE, _CABIN, _OBSTACLE = "#202020", "#D0D0D0", "#A9C9DE", "#4A4A4A"
+
+
+def write(scene: Scene, path: Path) -> None:
+    """Writes the recording; `ConfigError` without the package rerun-sdk."""
+    try:
+        import rerun as rr
+    except ImportError as error:
+        raise ConfigError(
+            f"{path}: expected the package rerun-sdk to write it, found: {error}; "
+            'pip install "vertiwm-jax[view]"'
+        ) from None
+    with rr.RecordingStream("vertiwm_jax") as stream:
+        stream.save(path, _layout(scene))
+        _ground(stream, scene)
+        _vehicle(stream, scene)
+        _paths(stream, scene)
+        _plots(stream, scene)
+
+
+def _layout(scene: Scene):
+    """The world, seen from behind the vehicle, over the plots."""
+    import rerun.blueprint as rrb
+
+    yaw = scene.state[0, 5]
+    eye = scene.state[0, :3] + np.array([-12 * np.cos(yaw), -12 * np.sin(yaw), 7.0])
+    world = rrb.Spatial3DView(
+        origin="world",
+        name=scene.title,
+        eye_controls=rrb.EyeControls3D(
+            position=eye, look_target=scene.state[0, :3], tracking_entity="world/vehicle"
+        ),
+    )
+    over_time = [
+        rrb.TimeSeriesView(origin=_entity("plots", title), name=title) for title in panels(scene)
+    ]
+    return rrb.Blueprint(
+        rrb.Vertical(world, rrb.Grid(*over_time, grid_columns=3), row_shares=[3, 2]),
+        rrb.TimePanel(timeline="time", state="collapsed", play_state="playing"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+def _ground(stream: rr.RecordingStream, scene: Scene) -> None:
+    import rerun as rr
+
+    log = partial(stream.log, static=True, strict=True)
+    terrain = scene.terrain
+    elevation = np.asarray(terrain.elevation[scene.world])
+    rows, columns = elevation.shape
+    west, east, south, north = picture.extent(terrain)
+    u, v = np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, rows))
+    x, y = west + u * (east - west), north - v * (north - south)
+    # The corners of each cell: north-west, north-east, south-west, south-east.
+    number = np.arange(rows * columns).reshape(rows, columns)
+    lower, upper = slice(1, None), slice(None, -1)
+    nw, ne, sw, se = (number[i, j].ravel() for i in (upper, lower) for j in (upper, lower))
+    image = (255 * picture.shaded(terrain, scene.world)).round().astype(np.uint8)
+    log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    log(
+        "world/terrain",
+        rr.Mesh3D(
+            vertex_positions=np.stack([x, y, elevation], axis=-1).reshape(-1, 3),
+            triangle_indices=np.stack([nw, sw, ne, ne, sw, se], axis=-1).reshape(-1, 3),
+            vertex_texcoords=np.stack([u, v], axis=-1).reshape(-1, 2),
+            albedo_texture=image,
+        ),
+    )
+    boxes = np.asarray(terrain.obstacles[scene.world])
+    boxes = boxes[boxes[:, 4] > 0]
+    if len(boxes):
+        base = np.asarray(query.height(terrain, jnp.asarray(boxes[:, :2])))
+        centres = np.column_stack([boxes[:, :2], base + boxes[:, 4] / 2])
+        log(
+            "world/obstacles",
+            rr.Boxes3D(
+                centers=centres, sizes=boxes[:, 2:], colors=_rgb(_OBSTACLE), fill_mode="solid"
+            ),
+        )
+    if scene.goal is not None:
+        around = np.linspace(0, 2 * np.pi, 73)
+        ring = scene.goal[:2] + scene.goal_radius * np.stack([np.cos(around), np.sin(around)], 1)
+        heights = np.asarray(query.height(terrain, jnp.asarray(ring, jnp.float32)))
+        log("world/goal/ring", rr.LineStrips3D([np.column_stack([ring, heights + 0.2])], colors=0))
+        log("world/goal", rr.Points3D([scene.goal], radii=0.6, colors=0))
+
+
+def _vehicle(stream: rr.RecordingStream, scene: Scene) -> None:
+    import rerun as rr
+
+    vehicle, hull = scene.vehicle, np.asarray(scene.vehicle.hull)
+    low, high = hull[:, 2].min(), hull[:, 2].max()
+    waist = (low + high) / 2
+    length = float(vehicle.length)
+    width = float(vehicle.track - vehicle.wheel_width)
+    radius, tyre = float(vehicle.wheel_radius), float(vehicle.wheel_width)
+    # The cabin, behind the bonnet, tells the front from the rear.
+    body = partial(
+        rr.Boxes3D,
+        mins=[[-length / 2, -width / 2, low], [-length / 2, -width / 2, waist]],
+        sizes=[[length, width, waist - low], [0.65 * length, width, high - waist]],
+    )
+    log = partial(stream.log, static=True, strict=True)
+    solid = rr.components.FillMode.Solid
+    log(
+        "world/vehicle/body",
+        body(colors=[_rgb(DRIVEN), _rgb(_CABIN)], fill_mode=solid),
+    )
+    poses = rr.Transform3D.columns(
+        translation=scene.state[:, :3], quaternion=_quaternion(scene.state[:, 3:6])
+    )
+    stream.send_columns("world/vehicle", _times(scene), poses, strict=True)
+    for i, name in enumerate(WHEELS):
+        entity = _entity("world", "vehicle", "wheels", name)
+        turn = np.stack(
+            [np.zeros(scene.steps + 1), scene.turned[:, i], scene.steering[:, i]], axis=1
+        )
+        place = np.broadcast_to([*vehicle.wheel_position[i], 0.0], (scene.steps + 1, 3))
+        poses = rr.Transform3D.columns(translation=place, quaternion=_quaternion(turn))
+        stream.send_columns(entity, _times(scene), poses, strict=True)
+        across = rr.RotationAxisAngle(axis=[1, 0, 0], radians=np.pi / 2)
+        log(
+            entity,
+            rr.Cylinders3D(
+                lengths=tyre,
+                radii=radius,
+                rotation_axis_angles=across,
+                colors=_rgb(_TYRE),
+                fill_mode=solid,
+            ),
+        )
+        spoke = [[1.5 * radius, 1.04 * tyre, 0.2 * radius]]
+        log(f"{entity}/spoke", rr.Boxes3D(sizes=spoke, colors=_rgb(_SPOKE), fill_mode=solid))
+    if scene.prediction:
+        states = scene.prediction.along(scene.prediction.states, scene.steps)
+        shown = np.flatnonzero(np.isfinite(states[:, 0]))
+        poses = rr.Transform3D.columns(
+            translation=states[shown, :3], quaternion=_quaternion(states[shown, 3:6])
+        )
+        stream.send_columns("world/predicted", _times(scene, shown), poses, strict=True)
+        ghost = body(colors=_rgb(PREDICTED), radii=0.03)
+        # Not before the first prediction.
+        stream.set_time("step", sequence=shown[0])
+        stream.set_time("time", duration=scene.seconds[shown[0]])
+        stream.log("world/predicted/body", ghost, strict=True)
+
+
+def _paths(stream: rr.RecordingStream, scene: Scene) -> None:
+    import rerun as rr
+
+    log = partial(stream.log, static=True, strict=True)
+    log("world/path", rr.LineStrips3D([scene.state[:, :3]], colors=_rgb(DRIVEN), radii=0.06))
+    if scene.prediction:
+        strips = scene.prediction.state[..., :3]
+        log("world/predictions", rr.LineStrips3D(strips, colors=_rgb(PREDICTED), radii=0.08))
+
+
+def _plots(stream: rr.RecordingStream, scene: Scene) -> None:
+    import rerun as rr
+
+    for title, lines in panels(scene).items():
+        for i, (name, values) in enumerate(lines.items()):
+            entity, known = _entity("plots", title, name), np.isfinite(values)
+            style = rr.SeriesLines(colors=_rgb(plots.line(i)[0]), names=name, widths=1.5)
+            stream.log(entity, style, static=True, strict=True)
+            columns = rr.Scalars.columns(scalars=values[known])
+            stream.send_columns(entity, _times(scene, known), columns, strict=True)
+
+
+def _times(scene: Scene, shown: np.ndarray | slice = slice(None)) -> list[rr.TimeColumn]:
+    """Both time lines of some of the states: steps, and seconds."""
+    import rerun as rr
+
+    return [
+        rr.TimeColumn("step", sequence=np.arange(scene.steps + 1)[shown]),
+        rr.TimeColumn("time", duration=scene.seconds[shown]),
+    ]
+
+
+def _quaternion(rpy: np.ndarray) -> np.ndarray:
+    """Roll, pitch, yaw `[..., 3]` to x, y, z, w `[..., 4]`."""
+    return np.roll(geometry.rotation_from_rpy(jnp.asarray(rpy, jnp.float32)).wxyz, -1, axis=-1)
+
+
+def _entity(*parts: str) -> str:
+    import rerun as rr
+
+    return rr.new_entity_path(list(parts))
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    """A colour such as #0072B2 as three numbers up to 255."""
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue

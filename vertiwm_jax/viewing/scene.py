@@ -1,0 +1,140 @@
+"""What is shown of a drive, whoever drove it."""
+
+from dataclasses import dataclass, field
+
+import jax
+import numpy as np
+
+from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
+from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model.fusion import COEFFICIENTS
+
+WHEELS = ("front left", "front right", "rear left", "rear right")
+TILT, FUSION = "roll and pitch [deg]", "fusion: 0 Transformer, 1 NeSAM"
+"""Titles of two panels."""
+Panels = dict[str, dict[str, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a model predicts open loop from N states of a drive, H steps each.
+
+    start: `[N]` the steps of the drive that it starts from.
+    state: `[N, H + 1, 12]`, of which the first are those of the drive.
+    coefficients: `[N, H, 4]` alpha of the steps; None of a model that does not fuse.
+    sinkage: `[N, H, 4]` m of the wheels after them; None of a model without wheels.
+    """
+
+    start: np.ndarray
+    state: np.ndarray
+    coefficients: np.ndarray | None = None
+    sinkage: np.ndarray | None = None
+
+    def along(self, values: np.ndarray, steps: int) -> np.ndarray:
+        """Values `[N, H, ...]` of predicted steps as `[steps + 1, ...]` of the drive, else NaN."""
+        found = np.full((steps + 1, *values.shape[2:]), np.nan, np.float32)
+        for start, part in zip(self.start, values, strict=True):
+            found[start + 1 : start + 1 + len(part)] = part
+        return found
+
+    @property
+    def states(self) -> np.ndarray:
+        """`[N, H, 12]` without those that it starts from."""
+        return self.state[:, 1:]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A drive of T steps of 0.1 s on the selected world of a map.
+
+    title: in a few words.
+    state: `[T + 1, 12]`; command: `[T, 2]` m/s and rad.
+    wheels: leaves `[T + 1, ...]`, as far as they are known; None of a model without wheels.
+    coefficients: `[T + 1, 4]` alpha that led to each state; None where nothing was fused.
+    goal: `[3]` m, reached within `goal_radius` m; None of a drive without one.
+    prediction: what a model says of the drive.
+    """
+
+    title: str
+    terrain: TerrainMap
+    state: np.ndarray
+    command: np.ndarray
+    wheels: Auxiliary | None = None
+    coefficients: np.ndarray | None = None
+    goal: np.ndarray | None = None
+    goal_radius: float = 0.0
+    prediction: Prediction | None = None
+    vehicle: Vehicle = field(default_factory=lambda: jax.device_get(hmmwv()))
+
+    @property
+    def steps(self) -> int:
+        """T."""
+        return len(self.command)
+
+    @property
+    def world(self) -> int:
+        """Which of the worlds of the map."""
+        return int(self.terrain.world)
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """`[T + 1]` time of the states, s."""
+        return STEP_SECONDS * np.arange(self.steps + 1)
+
+    @property
+    def commanded(self) -> np.ndarray:
+        """`[T + 1, 2]` the command at each state; the last one goes on."""
+        return self.command[np.minimum(np.arange(self.steps + 1), self.steps - 1)]
+
+    @property
+    def steering(self) -> np.ndarray:
+        """`[T + 1, 4]` rad, angle of each wheel to the left; as commanded where it is not known."""
+        front = self.wheels and self.wheels.steer_angle
+        if front is None:
+            front = np.repeat(self.commanded[:, 1:], 2, axis=1)
+        return np.concatenate([front, np.zeros_like(front)], axis=1)
+
+    @property
+    def turned(self) -> np.ndarray:
+        """`[T + 1, 4]` rad by which each wheel has turned forward; 0 where it is not known."""
+        speed = self.wheels and self.wheels.wheel_omega
+        if speed is None:
+            return np.zeros((self.steps + 1, 4))
+        return np.cumsum(speed, axis=0) * STEP_SECONDS
+
+
+def panels(scene: Scene) -> Panels:
+    """What is drawn over time: by title and then by name, `[T + 1]`, NaN where there is nothing."""
+    shown: Panels = {
+        TILT: {
+            "roll": np.degrees(scene.state[:, 3]),
+            "pitch": np.degrees(scene.state[:, 4]),
+        },
+        "speed [m/s]": {"driven": scene.state[:, 6], "commanded": scene.commanded[:, 0]},
+    }
+    alpha, prediction = scene.coefficients, scene.prediction
+    depth = scene.wheels and scene.wheels.wheel_sinkage
+    if depth is not None:
+        shown["wheel sinkage [mm]"] = _sinkage(np.asarray(depth))
+    if prediction:
+        states = prediction.along(prediction.states, scene.steps)
+        for name, row in (("roll", 3), ("pitch", 4)):
+            shown[TILT][f"{name}, predicted"] = np.degrees(states[:, row])
+        shown["speed [m/s]"]["predicted"] = states[:, 6]
+        error = np.linalg.norm(states[:, :3] - scene.state[:, :3], axis=1)
+        shown["position error [m]"] = {"position error": error}
+        if prediction.sinkage is not None:
+            depth = prediction.along(prediction.sinkage, scene.steps)
+            shown["wheel sinkage, predicted [mm]"] = _sinkage(depth)
+        if prediction.coefficients is not None:
+            alpha = prediction.along(prediction.coefficients, scene.steps)
+    if alpha is not None:
+        shown[FUSION] = dict(zip(COEFFICIENTS, alpha.T, strict=True))
+    return shown
+
+
+def _sinkage(depth: np.ndarray) -> dict[str, np.ndarray]:
+    # A recorded wheel that is in the air is above the ground, a modelled one has not sunk.
+    return dict(zip(WHEELS, 1000 * np.maximum(depth, 0.0).T, strict=True))
