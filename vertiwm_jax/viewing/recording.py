@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import rerun as rr
 
 DRIVEN, PREDICTED = (plots.line(i)[0] for i in (0, 1))
-_TYRE, _SPOKE, _CABIN, _OBSTACLE = "#202020", "#D0D0D0", "#A9C9DE", "#4A4A4A"
+_TYRE, _SPOKE, _CABIN, _OBSTACLE, _GOAL = "#202020", "#D0D0D0", "#A9C9DE", "#4A4A4A", "#000000"
 
 
 def write(scene: Scene, path: Path) -> None:
@@ -104,56 +104,26 @@ def _ground(stream: rr.RecordingStream, scene: Scene) -> None:
         around = np.linspace(0, 2 * np.pi, 73)
         ring = scene.goal[:2] + scene.goal_radius * np.stack([np.cos(around), np.sin(around)], 1)
         heights = np.asarray(query.height(terrain, jnp.asarray(ring, jnp.float32)))
-        log("world/goal/ring", rr.LineStrips3D([np.column_stack([ring, heights + 0.2])], colors=0))
-        log("world/goal", rr.Points3D([scene.goal], radii=0.6, colors=0))
+        log(
+            "world/goal/ring",
+            rr.LineStrips3D(
+                [np.column_stack([ring, heights + 0.2])], colors=_rgb(_GOAL), radii=0.08
+            ),
+        )
+        log("world/goal", rr.Points3D([scene.goal], radii=0.6, colors=_rgb(_GOAL)))
 
 
 def _vehicle(stream: rr.RecordingStream, scene: Scene) -> None:
     import rerun as rr
 
-    vehicle, hull = scene.vehicle, np.asarray(scene.vehicle.hull)
-    low, high = hull[:, 2].min(), hull[:, 2].max()
-    waist = (low + high) / 2
-    length = float(vehicle.length)
-    width = float(vehicle.track - vehicle.wheel_width)
-    radius, tyre = float(vehicle.wheel_radius), float(vehicle.wheel_width)
-    # The cabin, behind the bonnet, tells the front from the rear.
-    body = partial(
-        rr.Boxes3D,
-        mins=[[-length / 2, -width / 2, low], [-length / 2, -width / 2, waist]],
-        sizes=[[length, width, waist - low], [0.65 * length, width, high - waist]],
-    )
-    log = partial(stream.log, static=True, strict=True)
-    solid = rr.components.FillMode.Solid
-    log(
-        "world/vehicle/body",
-        body(colors=[_rgb(DRIVEN), _rgb(_CABIN)], fill_mode=solid),
-    )
     poses = rr.Transform3D.columns(
         translation=scene.state[:, :3], quaternion=_quaternion(scene.state[:, 3:6])
     )
     stream.send_columns("world/vehicle", _times(scene), poses, strict=True)
+    body = _body(scene, colors=[_rgb(DRIVEN), _rgb(_CABIN)], fill_mode="solid")
+    stream.log("world/vehicle/body", body, static=True, strict=True)
     for i, name in enumerate(WHEELS):
-        entity = _entity("world", "vehicle", "wheels", name)
-        turn = np.stack(
-            [np.zeros(scene.steps + 1), scene.turned[:, i], scene.steering[:, i]], axis=1
-        )
-        place = np.broadcast_to([*vehicle.wheel_position[i], 0.0], (scene.steps + 1, 3))
-        poses = rr.Transform3D.columns(translation=place, quaternion=_quaternion(turn))
-        stream.send_columns(entity, _times(scene), poses, strict=True)
-        across = rr.RotationAxisAngle(axis=[1, 0, 0], radians=np.pi / 2)
-        log(
-            entity,
-            rr.Cylinders3D(
-                lengths=tyre,
-                radii=radius,
-                rotation_axis_angles=across,
-                colors=_rgb(_TYRE),
-                fill_mode=solid,
-            ),
-        )
-        spoke = [[1.5 * radius, 1.04 * tyre, 0.2 * radius]]
-        log(f"{entity}/spoke", rr.Boxes3D(sizes=spoke, colors=_rgb(_SPOKE), fill_mode=solid))
+        _wheel(stream, scene, i, _entity("world", "vehicle", "wheels", name))
     if scene.prediction:
         states = scene.prediction.along(scene.prediction.states, scene.steps)
         shown = np.flatnonzero(np.isfinite(states[:, 0]))
@@ -161,11 +131,49 @@ def _vehicle(stream: rr.RecordingStream, scene: Scene) -> None:
             translation=states[shown, :3], quaternion=_quaternion(states[shown, 3:6])
         )
         stream.send_columns("world/predicted", _times(scene, shown), poses, strict=True)
-        ghost = body(colors=_rgb(PREDICTED), radii=0.03)
         # Not before the first prediction.
-        stream.set_time("step", sequence=shown[0])
-        stream.set_time("time", duration=scene.seconds[shown[0]])
-        stream.log("world/predicted/body", ghost, strict=True)
+        stream.set_time("step", sequence=int(shown[0]))
+        stream.set_time("time", duration=float(scene.seconds[shown[0]]))
+        outline = _body(scene, colors=_rgb(PREDICTED), radii=0.03)
+        stream.log("world/predicted/body", outline, strict=True)
+
+
+def _body(scene: Scene, **style: Any) -> rr.Boxes3D:
+    """Two boxes: the cabin, behind the bonnet, tells the front from the rear."""
+    import rerun as rr
+
+    vehicle, heights = scene.vehicle, np.asarray(scene.vehicle.hull)[:, 2]
+    low, high = heights.min(), heights.max()
+    waist = (low + high) / 2
+    length, width = float(vehicle.length), float(vehicle.track - vehicle.wheel_width)
+    return rr.Boxes3D(
+        mins=[[-length / 2, -width / 2, low], [-length / 2, -width / 2, waist]],
+        sizes=[[length, width, waist - low], [0.65 * length, width, high - waist]],
+        **style,
+    )
+
+
+def _wheel(stream: rr.RecordingStream, scene: Scene, i: int, entity: str) -> None:
+    """Wheel `i` at its place in the body, with a spoke that tells how far it has turned."""
+    import rerun as rr
+
+    radius, width = float(scene.vehicle.wheel_radius), float(scene.vehicle.wheel_width)
+    turned, steered = scene.turned[:, i], scene.steering[:, i]
+    attitude = np.stack([np.zeros_like(turned), turned, steered], axis=1)
+    place = np.broadcast_to([*scene.vehicle.wheel_position[i], 0.0], attitude.shape)
+    poses = rr.Transform3D.columns(translation=place, quaternion=_quaternion(attitude))
+    stream.send_columns(entity, _times(scene), poses, strict=True)
+    tyre = rr.Cylinders3D(
+        lengths=width,
+        radii=radius,
+        rotation_axis_angles=rr.RotationAxisAngle(axis=[1, 0, 0], radians=np.pi / 2),
+        colors=_rgb(_TYRE),
+        fill_mode="solid",
+    )
+    sizes = [[1.5 * radius, 1.04 * width, 0.2 * radius]]
+    spoke = rr.Boxes3D(sizes=sizes, colors=_rgb(_SPOKE), fill_mode="solid")
+    stream.log(entity, tyre, static=True, strict=True)
+    stream.log(f"{entity}/spoke", spoke, static=True, strict=True)
 
 
 def _paths(stream: rr.RecordingStream, scene: Scene) -> None:
