@@ -5,8 +5,17 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
+
+from vertiwm_jax import checkpoints
+from vertiwm_jax import config as configuration
+from vertiwm_jax.policy_training import TrainConfig
+from vertiwm_jax.rl import task
+from vertiwm_jax.rl.learned import MeanAction
+from vertiwm_jax.terrain import map as terrain_map
 
 Door = Callable[[Sequence[str] | None], None]
 
@@ -39,3 +48,26 @@ def refusal(door: Door, *argv: object) -> str:
     message = stop.value.code
     assert isinstance(message, str) and message.startswith("error: ") and "\n" not in message
     return message
+
+
+def untrained(kind: type[TrainConfig], run: Path) -> list[MeanAction]:
+    """Policies of random weights, one a seed, left as a checkpoint beside `config.yaml`."""
+    config = configuration.load(kind, run / "config.yaml")
+    level = terrain_map.build(np.zeros((129, 129)), np.zeros((1, 1), int))
+    training = task.test_environment(config, level)
+    algorithm = config.algorithm(training.env)
+    keys = jax.random.split(jax.random.key(0), config.loop.seeds)
+    shapes = jax.eval_shape(jax.vmap(algorithm.init, (None, 0)), training.params, keys)
+    rng = np.random.default_rng(0)
+
+    def drawn(leaf):
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return keys
+        return jnp.asarray(rng.uniform(0.1, 1, leaf.shape), leaf.dtype)
+
+    state = jax.tree.map(drawn, shapes)
+    checkpoints.save(run / "checkpoints", 1, state, keep=1)
+    return [
+        algorithm.policy(training.params, jax.tree.map(lambda x, i=i: x[i], state))
+        for i in range(config.loop.seeds)
+    ]

@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import onnxruntime
 import pytest
-from doors import refusal
+from doors import refusal, untrained
 from env.worlds import SNOW, bicycle_env, hills, task
 from flax import struct
 
-from vertiwm_jax import checkpoints, export, runs
-from vertiwm_jax import config as configuration
+from vertiwm_jax import export, runs
 from vertiwm_jax.deploy import onnx_graph, run_policy, stablehlo
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env import observation
@@ -24,7 +23,6 @@ from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZ
 from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.evaluation.controllers import LookAhead, StraightToGoal
 from vertiwm_jax.networks.policy import Actor, Senses, SquashedActor
-from vertiwm_jax.rl import task as tasks
 from vertiwm_jax.rl.learned import Corrected, MeanAction
 from vertiwm_jax.rl.normalise import RunningStatistics
 from vertiwm_jax.sac import SACTraining
@@ -203,22 +201,8 @@ def run_and_policy(tmp_path_factory):
     """A run of two seeds with random weights, and the policy of the second."""
     run = tmp_path_factory.mktemp("run")
     (run / "config.yaml").write_text(TINY)
-    config = configuration.load(SACTraining, run / "config.yaml")
-    level = terrain_map.build(np.zeros((129, 129)), np.zeros((1, 1), int))
-    training = tasks.test_environment(config, level)
-    algorithm, keys = config.algorithm(training.env), jax.random.split(jax.random.key(0))
-    shapes = jax.eval_shape(jax.vmap(algorithm.init, (None, 0)), training.params, keys)
-    rng = np.random.default_rng(0)
-
-    def drawn(leaf):
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            return keys
-        return jnp.asarray(rng.uniform(0.1, 1, leaf.shape), leaf.dtype)
-
-    state = jax.tree.map(drawn, shapes)
-    checkpoints.save(run / "checkpoints", 1, state, keep=1)
-    learned = algorithm.policy(training.params, jax.tree.map(lambda x: x[1], state))
-    return run, Corrected(LookAhead(config.navigation), learned)
+    policies = untrained(SACTraining, run)
+    return run, Corrected(LookAhead(CONFIG), policies[1])
 
 
 def test_a_run_is_exported_as_it_is_evaluated(run_and_policy, tmp_path, capsys):

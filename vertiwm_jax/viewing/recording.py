@@ -33,6 +33,7 @@ def write(scene: Scene, path: Path) -> None:
             'pip install "vertiwm-jax[view]"'
         ) from None
     with rr.RecordingStream("vertiwm_jax") as stream:
+        stream.set_log_time_enabled(False)
         stream.save(path, _layout(scene))
         _ground(stream, scene)
         _vehicle(stream, scene)

@@ -1,0 +1,86 @@
+"""The command that shows drives, from end to end."""
+
+import subprocess
+
+import numpy as np
+import pytest
+from doors import refusal, untrained
+from learning import recordings
+from PIL import Image
+from viewing.test_recording import read
+
+from vertiwm_jax import view
+from vertiwm_jax.mechanics.kinematic import ConstantVelocity
+from vertiwm_jax.sac import SACTraining
+
+TINY = """
+ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 2}
+simulator: {substeps: 1}
+navigation: {horizon_seconds: 2, settle_steps: 1}
+loop: {seeds: 2}
+sac:
+  {transitions: 64, num_envs: 8, num_steps: 8, batch: 8, capacity: 64, warm_up: 64, hidden: [8]}
+"""
+
+
+@pytest.fixture
+def uniform(monkeypatch):
+    """Models by name are one that compiles in no time."""
+    monkeypatch.setattr(view, "choose", lambda name, weights: (ConstantVelocity(), None))
+
+
+def test_a_recorded_drive(uniform, tmp_path, capsys, monkeypatch):
+    path = recordings.write(tmp_path)
+    argv = [str(path), "--drive", "4"]
+    view.main(argv)
+    recording, said = tmp_path / "a-drive-4.rrd", capsys.readouterr().out
+    assert "a, drive 4, and vertiwm" in said and said.endswith(f"look at it:\nrerun {recording}\n")
+    vehicle = read(recording)[0]["world/vehicle"]
+    expected = recordings.drives()["state"][4, :, :3]
+    np.testing.assert_allclose(np.squeeze(vehicle["Transform3D:translation"]), expected)
+    opened = []
+    monkeypatch.setattr(subprocess, "call", lambda argv: opened.append(argv) or 3)
+    other = tmp_path / "other.rrd"
+    message = refusal(view.main, *argv, "--output", other, "--open")
+    assert opened[0][1:] == ["-m", "rerun", str(other)] and other.is_file()
+    assert message.endswith("other.rrd: the rerun viewer ended with status 3")
+    view.main([*argv, "--movie", str(tmp_path / "a.gif")])
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == recordings.STEPS / 2 + 1
+    names = {"a.npz", "maps", "a-drive-4.rrd", "other.rrd", "a.gif"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+
+
+@pytest.mark.slow
+def test_a_policy_on_a_held_out_task(tmp_path, capsys):
+    (tmp_path / "config.yaml").write_text(TINY)
+    untrained(SACTraining, tmp_path)
+    argv = [str(tmp_path), "--model", "builtin", "--suite", "obstacles", "--seed", "1"]
+    view.main([*argv, "--task", "1"])
+    assert "sac, seed 1 in builtin: timed out, 2.0 s" in capsys.readouterr().out
+    entities, _ = read(tmp_path / "obstacles-1-builtin.rrd")
+    assert entities["world/vehicle"]["step"] == list(range(21))
+    assert {"world/goal", "world/obstacles"} <= set(entities)
+    assert any("sinkage" in entity for entity in entities)
+    assert "task: expected 0 to 1, found 2" in refusal(view.main, *argv, "--task", 2)
+    assert "drive: is of a file" in refusal(view.main, *argv, "--drive", 0)
+    (tmp_path / "checkpoints" / "1").rename(tmp_path / "gone")
+    assert "expected checkpoints of a training" in refusal(view.main, *argv)
+
+
+def test_what_cannot_be_shown_is_named(uniform, tmp_path, capsys):
+    path = recordings.write(tmp_path)
+    before = {path.name for path in tmp_path.iterdir()}
+    assert "a.npz: suite: is of a policy" in refusal(view.main, path, "--suite", "easy")
+    assert "drive: expected 0 to 24, found 99" in refusal(view.main, path, "--drive", 99)
+    assert "none.npz: " in refusal(view.main, tmp_path / "none.npz")
+    assert "maps/config.yaml: no such file" in refusal(view.main, tmp_path / "maps")
+    nowhere = tmp_path / "none" / "a.rrd"
+    assert "none/a.rrd: cannot write" in refusal(view.main, path, "--output", nowhere)
+    assert {path.name for path in tmp_path.iterdir()} == before
+    for options in (["--movie", "a.avi"], ["--movie", "a.gif", "--open"]):
+        with pytest.raises(SystemExit) as stop:
+            view.main([str(path), *options])
+        assert stop.value.code == 2
+    found = capsys.readouterr().err
+    assert "expected the ending .gif or .mp4, found .avi" in found and "leave out output" in found
