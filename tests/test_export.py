@@ -13,6 +13,7 @@ from doors import refusal, untrained
 from env.worlds import SNOW, bicycle_env, hills, task
 from flax import struct
 
+from vertiwm_jax import config as configuration
 from vertiwm_jax import export, runs
 from vertiwm_jax.deploy import onnx_graph, run_policy, stablehlo
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
@@ -202,7 +203,8 @@ def run_and_policy(tmp_path_factory):
     run = tmp_path_factory.mktemp("run")
     (run / "config.yaml").write_text(TINY)
     policies = untrained(SACTraining, run)
-    return run, Corrected(LookAhead(CONFIG), policies[1])
+    config = configuration.load(SACTraining, run / "config.yaml")
+    return run, Corrected(LookAhead(config.navigation), policies[1])
 
 
 def test_a_run_is_exported_as_it_is_evaluated(run_and_policy, tmp_path, capsys):

@@ -8,6 +8,7 @@ import json
 import math
 import os
 import shutil
+import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
@@ -279,6 +280,19 @@ def write_atomic(path: str | Path, data: bytes | str) -> None:
             raise
     except OSError as error:
         raise RunError(f"{path}: cannot write, the file is as it was: {error}") from error
+
+
+@contextlib.contextmanager
+def new_content(path: str | Path) -> Iterator[Path]:
+    """A file to fill, which then replaces that at `path` as `write_atomic` does.
+
+    For what can be written to files only.
+    """
+    path = Path(path)
+    with tempfile.TemporaryDirectory() as folder:
+        unfinished = Path(folder) / path.name
+        yield unfinished
+        write_atomic(path, unfinished.read_bytes())
 
 
 @contextlib.contextmanager

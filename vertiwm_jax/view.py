@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import jax
 import tyro
 
-from vertiwm_jax import policy_training, runs
+from vertiwm_jax import policy_training
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.evaluate import training
@@ -74,23 +73,30 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def view(command: View) -> Path:
     """Writes what was asked for, as a whole or not at all; the file."""
-    show = _driven if command.source.is_dir() else _recorded
+    of_run = command.source.is_dir()
+    form = movie if command.movie else recording
+    path = command.movie or command.output or (_beside_run if of_run else _beside_file)(command)
+    form.check(path)
     try:
-        scene, beside = show(command)
+        scene = (_driven if of_run else _recorded)(command)
     except ValueError as error:  # what is wrong with drives, maps, or tasks on them
         sys.exit(f"error: {error}")
     print(scene.title, flush=True)
-    path = command.movie or command.output or beside
-    write = movie.write if command.movie else recording.write
-    with tempfile.TemporaryDirectory() as folder:
-        unfinished = Path(folder) / path.name
-        write(scene, unfinished)
-        runs.write_atomic(path, unfinished.read_bytes())
+    form.write(scene, path)
     return path
 
 
-def _driven(command: View) -> tuple[Scene, Path]:
-    """The policy of a run on its task, and where the recording goes by default."""
+def _beside_run(command: View) -> Path:
+    task = f"{command.suite or 'held-out'}-{command.task or 0}"
+    return command.source / f"{task}-{command.model}.rrd"
+
+
+def _beside_file(command: View) -> Path:
+    return command.source.with_name(f"{command.source.stem}-drive-{command.drive or 0}.rrd")
+
+
+def _driven(command: View) -> Scene:
+    """The policy of a run on its task."""
     run, number, seed = command.source, command.task or 0, command.seed or 0
     if command.drive is not None:
         raise ConfigError(f"{run}: drive: is of a file of drives, found the folder of a run")
@@ -109,14 +115,12 @@ def _driven(command: View) -> tuple[Scene, Path]:
     alone = jax.tree.map(lambda x: x[number : number + 1], pool)
     test = task.environment(config, command.model, terrain, alone)
     name, policy = list(policies.items())[seed]
-    where = f"{command.suite or 'held-out'}-{number}-{command.model}"
     title = f"{name} in {command.model}"
-    scene = driven.drive(test.env, test.params, policy, config.key("testing"), title)
-    return scene, run / f"{where}.rrd"
+    return driven.drive(test.env, test.params, policy, config.key("testing"), title)
 
 
-def _recorded(command: View) -> tuple[Scene, Path]:
-    """The drive of a file beside a model's predictions, and where the recording goes by default."""
+def _recorded(command: View) -> Scene:
+    """The drive of a file beside a model's predictions."""
     file, number = command.source, command.drive or 0
     for name in ("suite", "task", "seed"):
         if getattr(command, name) is not None:
@@ -124,8 +128,7 @@ def _recorded(command: View) -> tuple[Scene, Path]:
                 f"{file}: {name}: is of a policy, expected the folder of a run, found none"
             )
     model = choose(command.model, command.weights)
-    scene = recorded.load(file, number, command.model, *model)
-    return scene, file.with_name(f"{file.stem}-drive-{number}.rrd")
+    return recorded.load(file, number, command.model, *model)
 
 
 if __name__ == "__main__":

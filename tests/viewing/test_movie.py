@@ -41,7 +41,6 @@ def test_a_gif_of_every_second_step(tmp_path):
         first = np.asarray(image.convert("RGB"), int)
         image.seek(10)
         assert np.abs(np.asarray(image.convert("RGB")) - first).max() > 100
-    assert len(movie.draw(bare())[0].axes) == 2
 
 
 def test_an_mp4(tmp_path, monkeypatch):

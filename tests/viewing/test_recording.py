@@ -83,3 +83,16 @@ def test_without_rerun(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(ConfigError, match=r'scene\.rrd: expected .*"vertiwm-jax\[view\]"'):
         recording.write(scene(), tmp_path / "scene.rrd")
+
+
+def test_a_recording_that_fails_leaves_the_old_one(tmp_path, monkeypatch):
+    path = tmp_path / "scene.rrd"
+    path.write_bytes(b"old")
+
+    def fail(stream, scene):
+        raise RuntimeError("in the middle")
+
+    monkeypatch.setattr(recording, "_plots", fail)
+    with pytest.raises(RuntimeError, match="in the middle"):
+        recording.write(bare(), path)
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]

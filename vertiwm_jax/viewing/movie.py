@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vertiwm_jax import runs
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env import picture
 from vertiwm_jax.evaluation import plots
@@ -27,7 +28,7 @@ MARGIN = 5.0
 """m from those at which the window moves on."""
 DOTS = 80
 """An inch."""
-COLOURS = 128
+COLOURS = 64
 """Of all frames of a GIF."""
 _LABELS = {TILT: "angle [deg]", FUSION: "0 Transformer,\n1 NeSAM"}
 """Of the panels that are drawn."""
@@ -37,12 +38,17 @@ _RECTANGLE = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) / 2
 Show = Callable[[int], None]
 
 
+def check(path: Path) -> None:
+    """`ConfigError`, which names the movie, without the package that writes it."""
+    WRITERS[path.suffix](path)
+
+
 def write(scene: Scene, path: Path) -> None:
-    """Writes the movie, as its ending says; `ConfigError` without what writes it."""
+    """Writes the movie as a whole, or not at all; raises like `check`, and `RunError`."""
     from matplotlib.animation import FuncAnimation
 
     writer = WRITERS[path.suffix](path)
-    with plots.style():
+    with plots.style(), runs.new_content(path) as unfinished:
         figure, show = draw(scene)
 
         def frame(step: int) -> list:
@@ -50,7 +56,7 @@ def write(scene: Scene, path: Path) -> None:
             return []
 
         steps = range(0, scene.steps + 1, EVERY)
-        FuncAnimation(figure, frame, steps, init_func=list).save(path, writer, dpi=DOTS)
+        FuncAnimation(figure, frame, steps, init_func=list).save(unfinished, writer, dpi=DOTS)
 
 
 def draw(scene: Scene) -> tuple[Figure, Show]:

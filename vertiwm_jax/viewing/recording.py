@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax import geometry
+from vertiwm_jax import geometry, runs
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env import picture
 from vertiwm_jax.evaluation import plots
@@ -23,22 +23,30 @@ DRIVEN, PREDICTED = (plots.line(i)[0] for i in (0, 1))
 _TYRE, _SPOKE, _CABIN, _OBSTACLE, _GOAL = "#202020", "#D0D0D0", "#A9C9DE", "#4A4A4A", "#000000"
 
 
-def write(scene: Scene, path: Path) -> None:
-    """Writes the recording; `ConfigError` without the package rerun-sdk."""
+def check(path: Path) -> None:
+    """`ConfigError`, which names the recording, without the package rerun-sdk."""
     try:
-        import rerun as rr
+        import rerun  # noqa: F401
     except ImportError as error:
         raise ConfigError(
             f"{path}: expected the package rerun-sdk to write it, found: {error}; "
             'pip install "vertiwm-jax[view]"'
         ) from None
-    with rr.RecordingStream("vertiwm_jax") as stream:
+
+
+def write(scene: Scene, path: Path) -> None:
+    """Writes the recording as a whole, or not at all; raises like `check`, and `RunError`."""
+    check(path)
+    import rerun as rr
+
+    with runs.new_content(path) as unfinished, rr.RecordingStream("vertiwm_jax") as stream:
         stream.set_log_time_enabled(False)
-        stream.save(path, _layout(scene))
+        stream.save(unfinished, _layout(scene))
         _ground(stream, scene)
         _vehicle(stream, scene)
         _paths(stream, scene)
         _plots(stream, scene)
+        stream.disconnect()
 
 
 def _layout(scene: Scene):
