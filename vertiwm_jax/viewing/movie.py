@@ -28,8 +28,8 @@ MARGIN = 5.0
 """m from those at which the window moves on."""
 DOTS = 80
 """An inch."""
-COLOURS = 64
-"""Of all frames of a GIF."""
+COLOURS = 56
+"""Of all frames of a GIF, besides those of lines."""
 _LABELS = {TILT: "angle [deg]", FUSION: "0 Transformer,\n1 NeSAM"}
 """Of the panels that are drawn."""
 _DRIVEN, _PREDICTED = (plots.line(i)[0] for i in (0, 1))
@@ -188,6 +188,8 @@ def _gif(path: Path) -> AbstractMovieWriter:
             some = self._frames[:: max(1, len(self._frames) // 8)]
             sheet = Image.fromarray(np.concatenate([np.asarray(frame) for frame in some]))
             palette, plain = sheet.quantize(COLOURS), Image.Dither.NONE
+            lines = b"".join(bytes.fromhex(plots.line(i)[0][1:]) for i in range(7)) + b"\xff" * 3
+            palette.putpalette((palette.getpalette() or [])[: 3 * COLOURS] + list(lines))
             self._frames = [frame.quantize(palette=palette, dither=plain) for frame in self._frames]
             super().finish()
 
