@@ -104,6 +104,7 @@ class Table:
     """Names of the columns of a CSV or Parquet file, a row a moment."""
 
     time: str
+    """When the row was logged."""
     position: Names
     """x, y, z."""
     speed: str
@@ -133,6 +134,7 @@ class GridMapSettings:
     """Ground from all messages of a grid_map_msgs/GridMap topic; the newest height counts."""
 
     topic: str
+    """Name of the topic."""
     elevation: str = "elevation"
     """Layer of heights, m."""
     semantic: str | None = None

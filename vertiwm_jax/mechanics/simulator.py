@@ -124,9 +124,10 @@ class _Body(NamedTuple):
 
 @dataclass(frozen=True)
 class Simulator:
-    """The dynamics `init` / `step` of the built-in simulator; `substeps` per 0.1 s."""
+    """The dynamics `init` / `step` of the built-in simulator."""
 
     substeps: int = 5
+    """Steps of the integrator in 0.1 s."""
 
     def init(
         self, params: SimulatorParams, terrain: TerrainMap, state: VehicleState
