@@ -1,0 +1,89 @@
+"""What the documentation shows is true: its examples run, and its commands exist."""
+
+import importlib
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import tyro
+
+from vertiwm_jax import config as configuration
+from vertiwm_jax.collect import Collect
+from vertiwm_jax.ppo import PPOTraining
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+WITH_EXAMPLES = [
+    "README.md",
+    "docs/own-map.md",
+    pytest.param("docs/getting-started.md", marks=pytest.mark.slow),
+]
+
+
+def blocks(page, language):
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize("name", WITH_EXAMPLES)
+def test_examples_run_from_top_to_bottom(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": "example"}
+    found = blocks(ROOT / name, "python")
+    assert found
+    for block in found:
+        exec(compile(block, name, "exec"), names)
+
+
+def commands():
+    """Every `python -m vertiwm_jax...` of a bash block, and the page that shows it."""
+    for page in PAGES:
+        for block in blocks(page, "bash"):
+            for line in block.replace("\\\n", " ").splitlines():
+                command = line.partition("#")[0].rpartition("&& ")[2].strip()
+                if command.startswith("python -m vertiwm_jax"):
+                    yield pytest.param(command, id=f"{page.name}: {command}")
+
+
+class Understood(Exception):
+    """What a command line was read as."""
+
+
+@pytest.fixture
+def reading(tmp_path, monkeypatch):
+    """Commands end once their arguments are read, in a folder that has what these name."""
+    read = tyro.cli
+
+    def only_read(*args, **kwargs):
+        raise Understood(read(*args, **kwargs))
+
+    monkeypatch.setattr(tyro, "cli", only_read)
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "runs" / "ppo-<date>-<time>"
+    run.mkdir(parents=True)
+    configuration.save(PPOTraining(), run / "config.yaml")
+    configuration.save(PPOTraining(), tmp_path / "my.yaml")
+    (tmp_path / "configs").symlink_to(ROOT / "configs")
+
+
+@pytest.mark.parametrize("command", list(commands()))
+def test_commands_are_understood(command, reading):
+    _, _, module, *argv = shlex.split(command.replace("<date>-<time>", "'<date>-<time>'"))
+    main = importlib.import_module(module).main
+    if "--help" in argv:
+        with pytest.raises(SystemExit) as stop:
+            main(argv)
+        assert stop.value.code == 0
+        return
+    with pytest.raises(Understood):
+        main(argv)
+
+
+def test_a_command_that_does_not_exist_would_be_found(reading):
+    with pytest.raises(SystemExit) as stop:
+        importlib.import_module("vertiwm_jax.collect").main(["--folder", "drives"])
+    assert stop.value.code == 2
+    with pytest.raises(Understood) as read:
+        importlib.import_module("vertiwm_jax.collect").main(["--output", "drives"])
+    assert read.value.args == (Collect(Path("drives")),)
+    assert len(list(commands())) > 20
