@@ -1,0 +1,1 @@
+"""The shipped world model as others would write it, for benchmarks that compare with them."""

@@ -1,0 +1,143 @@
+"""The terrain map in PyTorch: patches by `affine_grid` and `grid_sample`, and ground under points.
+
+As `vertiwm_jax.terrain.query`, for the patches of the shipped model: heights relative to the
+vehicle, bilinear, and the colour of the cell of each pixel.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.query import PATCH_METRES, PATCH_PIXELS, RELIEF_METRES
+
+SOIL = ("kc", "kphi", "n", "cohesion", "friction_angle", "shear_modulus")
+"""Columns of a soil, named as in `terrain.soil.Soil`."""
+
+
+def tensor(array: jax.Array | np.ndarray) -> Tensor:
+    """A copy of any array."""
+    return torch.from_numpy(np.array(array))
+
+
+_NORTH_UP = torch.tensor([1.0, -1.0])
+
+
+class Ground(NamedTuple):
+    """The map under each vehicle of a batch, or of each world.
+
+    heights: `[B, 1, R, C]` m, on vertices. colours: `[B, 3, r, c]` in [-1, 1], of cells.
+    semantic: `[B, r, c]` class ids. friction: `[B, r, c]`, 0 on soil.
+    deformable: `[K]` bool. soils: `[K, 6]`, in the order of `SOIL`.
+    origin: `[2]` x, y of vertex (0, 0), m. extent: `[2]` m. resolution: m between vertices.
+    """
+
+    heights: Tensor
+    colours: Tensor
+    semantic: Tensor
+    friction: Tensor
+    deformable: Tensor
+    soils: Tensor
+    origin: Tensor
+    extent: Tensor
+    resolution: float
+
+    @classmethod
+    def of(cls, terrain: TerrainMap) -> "Ground":
+        """All worlds of a map."""
+        palette = np.asarray(terrain.class_rgb, np.float32) / 127.5 - 1
+        semantic, grip = np.asarray(terrain.semantic, np.int64), terrain.grip
+        _, rows, columns = terrain.elevation.shape
+        resolution = float(terrain.resolution)
+        soils: Any = [getattr(terrain.soils, name) for name in SOIL]
+        return cls(
+            heights=tensor(terrain.elevation)[:, None],
+            colours=tensor(palette[semantic].transpose(0, 3, 1, 2)).contiguous(),
+            semantic=tensor(semantic),
+            friction=tensor(terrain.friction if grip is None else grip * terrain.friction),
+            deformable=tensor(terrain.deformable),
+            soils=tensor(np.stack(soils, axis=-1)),
+            origin=tensor(terrain.origin),
+            extent=resolution * torch.tensor([columns - 1.0, rows - 1.0]),
+            resolution=resolution,
+        )
+
+    def select(self, worlds: Tensor) -> "Ground":
+        """The world `[B]` of each vehicle: `grid_sample` wants one image for each."""
+        return self._replace(
+            heights=self.heights[worlds],
+            colours=self.colours[worlds],
+            semantic=self.semantic[worlds],
+            friction=self.friction[worlds],
+        )
+
+
+class Surface(NamedTuple):
+    """The ground at points: height `[B, N]` m, gradient `[B, N, 2]`, class id, friction."""
+
+    height: Tensor
+    gradient: Tensor
+    semantic: Tensor
+    friction: Tensor
+
+
+def patches(ground: Ground, state: Tensor) -> tuple[Tensor, Tensor]:
+    """States `[B, 12]` to elevation `[B, 1, 128, 128]` and colours `[B, 3, 128, 128]`.
+
+    Row 0 is farthest ahead, column 0 farthest left; both in [-1, 1].
+    """
+    shape = (len(state), 1, PATCH_PIXELS, PATCH_PIXELS)
+    cos, sin = torch.cos(state[:, 5]), torch.sin(state[:, 5])
+    across, down = (PATCH_METRES / ground.extent).unbind()
+    x, y = (2 * (state[:, :2] - ground.origin) / ground.extent).unbind(-1)
+    rows = [
+        *(across * sin, -across * cos, x - 1),
+        *(down * cos, down * sin, -y - 1),
+    ]
+    grid = F.affine_grid(torch.stack(rows, -1).view(-1, 2, 3), list(shape), align_corners=False)
+    heights = F.grid_sample(
+        ground.heights, grid, mode="bilinear", padding_mode="border", align_corners=True
+    )
+    colours = F.grid_sample(
+        ground.colours, grid, mode="nearest", padding_mode="border", align_corners=False
+    )
+    elevation = (heights - state[:, 2, None, None, None]) / RELIEF_METRES
+    return elevation.clamp(-1, 1), colours
+
+
+def surface(ground: Ground, xy: Tensor) -> Surface:
+    """The ground as wheels meet it at points `[B, N, 2]` p_world, m.
+
+    Between vertices, soil is bilinear and rigid ground two triangles.
+    """
+    _, _, rows, columns = ground.heights.shape
+    _, cell_rows, cell_columns = ground.semantic.shape
+    vehicle = torch.arange(len(xy))[:, None]
+    from_corner = (xy - ground.origin) * _NORTH_UP
+    column, row = (from_corner / ground.resolution).unbind(-1)
+    column, row = column.clamp(0, columns - 1), row.clamp(0, rows - 1)
+
+    i = (row * (cell_rows / (rows - 1))).long().clamp(max=cell_rows - 1)
+    j = (column * (cell_columns / (columns - 1))).long().clamp(max=cell_columns - 1)
+    semantic = ground.semantic[vehicle, i, j]
+    soft = ground.deformable[semantic]
+
+    r, c = row.long().clamp(max=rows - 2), column.long().clamp(max=columns - 2)
+    fx, fy = column - c, 1 - (row - r)
+    heights = ground.heights[:, 0]
+    bottom_left = heights[vehicle, r + 1, c]
+    along = heights[vehicle, r + 1, c + 1] - bottom_left
+    up = heights[vehicle, r, c] - bottom_left
+    twist = heights[vehicle, r, c + 1] - bottom_left - up - along
+    rising = (fx > fy).float()
+    height = bottom_left + fx * along + fy * up
+    height = height + twist * torch.where(soft, fx * fy, torch.minimum(fx, fy))
+    slope_x = along + twist * torch.where(soft, fy, 1 - rising)
+    slope_y = up + twist * torch.where(soft, fx, rising)
+    inside = (from_corner >= 0) & (from_corner <= ground.extent)
+    gradient = torch.stack([slope_x, slope_y], dim=-1) / ground.resolution
+    return Surface(height, gradient * inside, semantic, ground.friction[vehicle, i, j])
