@@ -5,6 +5,7 @@ import json
 import pkgutil
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from benchmarks._harness import cell
 
 _APART = {"recurrent_baseline"}
 """Those that need a folder of drives, and train."""
+_NEEDS = {"torch_peer": "torch"}
+"""Packages of the extra `peers` that some compare with."""
 
 
 def page(found: dict[str, Any]) -> str:
@@ -34,15 +37,20 @@ def main() -> None:
     arguments = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     arguments.add_argument("--output", type=Path, default=Path("benchmarks.md"))
     chosen = arguments.parse_args()
-    names = [module.name for module in pkgutil.iter_modules(benchmarks.__path__)]
+    modules = pkgutil.iter_modules(benchmarks.__path__)
+    names = [module.name for module in modules if not module.ispkg]
     found = {}
     for name in names:
-        if not name.startswith("_") and name not in _APART:
-            print(f"{name} ...", flush=True)
-            command = [sys.executable, "-m", f"benchmarks.{name}", "--json"]
-            done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-            found[name] = json.loads(done.stdout.splitlines()[-1])
-            chosen.output.write_text(page(found), encoding="utf-8")
+        if name.startswith("_") or name in _APART:
+            continue
+        if name in _NEEDS and not find_spec(_NEEDS[name]):
+            print(f'{name} is left out: it needs {_NEEDS[name]} (pip install -e ".[peers]")')
+            continue
+        print(f"{name} ...", flush=True)
+        command = [sys.executable, "-m", f"benchmarks.{name}", "--json"]
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+        found[name] = json.loads(done.stdout.splitlines()[-1])
+        chosen.output.write_text(page(found), encoding="utf-8")
     print(f"written to {chosen.output}")
 
 

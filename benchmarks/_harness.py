@@ -58,16 +58,21 @@ def hardware() -> dict[str, str | int]:
     return {
         "cpu": _cpu_model(),
         "cores": os.cpu_count() or 1,
-        "threads": _usable_threads(),
+        "threads": usable_threads(),
         "device": f"{device.platform}: {device.device_kind}",
         "jax": jax.__version__,
         "python": platform.python_version(),
     }
 
 
-def report(name: str, results: Mapping[str, Figures], as_json: bool) -> None:
-    """Print one row of figures per case, with the hardware, as a table or one JSON object."""
-    machine = hardware()
+def report(
+    name: str, results: Mapping[str, Figures], as_json: bool, also: Figures | None = None
+) -> None:
+    """Print one row of figures per case, with the hardware, as a table or one JSON object.
+
+    also: what else the figures were measured on, beside `hardware`.
+    """
+    machine = hardware() | dict(also or {})
     if as_json:
         print(json.dumps({"benchmark": name, "hardware": machine, "results": results}))
         return
@@ -90,7 +95,8 @@ def cell(value: float | int | str) -> str:
     return f"{value:,}" if isinstance(value, int) else value
 
 
-def _usable_threads() -> int:
+def usable_threads() -> int:
+    """Cores that this process may use."""
     # Affinity is Linux only; elsewhere every core may be used.
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1

@@ -96,16 +96,18 @@ class Simulator:
         """States `[B, 12]` and commands `[B, 2]` to the next states."""
         centre, angular = self.vehicle.centre_of_mass, state[:, 9:]
         linear = state[:, 6:9] + _cross(angular, centre)
-        body = Body(state[:, :3], motion.quaternion(state[:, 3:6]), linear, angular)
+        position = state[:, :3].contiguous()
+        body = Body(position, motion.quaternion(state[:, 3:6]), linear, angular.contiguous())
         for _ in range(self.substeps):
-            body, memory = self._substep(ground, body, memory, command)
+            body, memory = self.substep(ground, body, memory, command)
         velocity = body.linear - _cross(body.angular, centre)
         parts = (body.position, motion.rpy(body.quaternion), velocity, body.angular)
         return torch.cat(parts, dim=-1), memory
 
-    def _substep(
+    def substep(
         self, ground: Ground, body: Body, memory: Memory, command: Tensor
     ) -> tuple[Body, Memory]:
+        """Body and memory after `seconds`."""
         vehicle, seconds, radius = self.vehicle, self.seconds, self.vehicle.wheel_radius
         rotation = motion.matrix(body.quaternion)
         forward = body.linear[:, 0]

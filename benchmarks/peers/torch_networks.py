@@ -17,7 +17,6 @@ from vertiwm_jax.world_model.specialist_network import WINDOW
 Weights = Mapping[str, Any]
 """What flax calls the parameters of a module."""
 PERIODS_A_WINDOW = 16
-_LATENT_SIDE = 16
 _NORM_EPSILON = 1e-6
 
 
@@ -28,9 +27,15 @@ class Encoder(nn.Module):
         super().__init__()
         planes, _, latent = weights["cell_kernel"].shape
         cells = tensor(weights["cell_kernel"]).view(planes, CELL_PIXELS, CELL_PIXELS, latent)
-        self.cells = _convolution(cells.permute(1, 2, 0, 3), weights["cell_bias"], CELL_PIXELS)
-        self.shrink = _convolution(weights["Conv_0"]["kernel"], weights["Conv_0"]["bias"], 2)
-        self.mix = _convolution(weights["Conv_1"]["kernel"], weights["Conv_1"]["bias"], 1, 1)
+        self.cells = _convolution(
+            cells.permute(1, 2, 0, 3), tensor(weights["cell_bias"]), stride=CELL_PIXELS
+        )
+        shrink, mix = (
+            [tensor(weights[name][part]) for part in ("kernel", "bias")]
+            for name in ("Conv_0", "Conv_1")
+        )
+        self.shrink = _convolution(*shrink, stride=2)
+        self.mix = _convolution(*mix, padding=1)
         # pixel_shuffle has the places of a block innermost, flax's kernel has them outermost.
         kernel, bias = (
             tensor(weights["expand"][name]).unflatten(-1, (4, latent)).transpose(-1, -2).flatten(-2)
@@ -165,11 +170,11 @@ def _linear(weights: Weights) -> nn.Linear:
     return made
 
 
-def _convolution(kernel: Any, bias: Any, stride: int = 1, padding: int = 0) -> nn.Conv2d:
+def _convolution(kernel: Tensor, bias: Tensor, stride: int = 1, padding: int = 0) -> nn.Conv2d:
     """From flax's kernel, `[height, width, in, out]`."""
-    kernel = tensor(kernel).permute(3, 2, 0, 1).contiguous()
+    kernel = kernel.permute(3, 2, 0, 1).contiguous()
     made = nn.Conv2d(kernel.shape[1], kernel.shape[0], kernel.shape[2], stride, padding)
-    made.weight, made.bias = nn.Parameter(kernel), nn.Parameter(tensor(bias))
+    made.weight, made.bias = nn.Parameter(kernel), nn.Parameter(bias)
     return made
 
 

@@ -1,4 +1,4 @@
-"""The terrain map in PyTorch: patches by `affine_grid` and `grid_sample`, and ground under points.
+"""The terrain map in PyTorch: patches by `grid_sample`, and ground under points.
 
 As `vertiwm_jax.terrain.query`, for the patches of the shipped model: heights relative to the
 vehicle, bilinear, and the colour of the cell of each pixel.
@@ -24,6 +24,7 @@ def tensor(array: jax.Array | np.ndarray) -> Tensor:
     return torch.from_numpy(np.array(array))
 
 
+_PLACES = (2 * torch.arange(PATCH_PIXELS) + 1) / PATCH_PIXELS - 1
 _NORTH_UP = torch.tensor([1.0, -1.0])
 
 
@@ -90,15 +91,14 @@ def patches(ground: Ground, state: Tensor) -> tuple[Tensor, Tensor]:
 
     Row 0 is farthest ahead, column 0 farthest left; both in [-1, 1].
     """
-    shape = (len(state), 1, PATCH_PIXELS, PATCH_PIXELS)
-    cos, sin = torch.cos(state[:, 5]), torch.sin(state[:, 5])
+    cos, sin = torch.cos(state[:, 5, None, None]), torch.sin(state[:, 5, None, None])
     across, down = (PATCH_METRES / ground.extent).unbind()
-    x, y = (2 * (state[:, :2] - ground.origin) / ground.extent).unbind(-1)
-    rows = [
-        *(across * sin, -across * cos, x - 1),
-        *(down * cos, down * sin, -y - 1),
-    ]
-    grid = F.affine_grid(torch.stack(rows, -1).view(-1, 2, 3), list(shape), align_corners=False)
+    x, y = (2 * (state[:, :2] - ground.origin) / ground.extent)[..., None, None].unbind(1)
+    # Sums of a row and a column, in two planes: affine_grid takes several times as long.
+    u, v = _PLACES, _PLACES[:, None]
+    columns = (x - 1 - across * cos * v) + across * sin * u
+    rows = (-y - 1 + down * sin * v) + down * cos * u
+    grid = torch.stack([columns, rows], dim=1).permute(0, 2, 3, 1)
     heights = F.grid_sample(
         ground.heights, grid, mode="bilinear", padding_mode="border", align_corners=True
     )

@@ -68,24 +68,21 @@ def touch(
         soil=ground.soils[semantic],
         edge=torch.zeros_like(semantic, dtype=torch.bool),
     )
-    samples = (
+    samples = [
         x[:, :count].unflatten(1, (RIM_POINTS, WHEELS))
         for x in (points, normal, depth, below.friction, below.semantic)
-    )
-    return _wheel_contacts(ground, *samples, steering, sinkage), on_hull
+    ]
+    return _wheel_contacts(ground, samples, steering, sinkage), on_hull
 
 
 def _wheel_contacts(
-    ground: Ground,
-    point: Tensor,
-    normal: Tensor,
-    depth: Tensor,
-    friction: Tensor,
-    semantic: Tensor,
-    steering: Tensor,
-    sinkage: Tensor,
+    ground: Ground, samples: list[Tensor], steering: Tensor, sinkage: Tensor
 ) -> Touch:
-    """One contact `[B, 4]` of each wheel, shared by its points `[B, 10, 4]`."""
+    """One contact `[B, 4]` of each wheel, shared by its points.
+
+    samples: point, normal, depth, friction and class id of them, `[B, 10, 4, ...]`.
+    """
+    point, normal, depth, friction, semantic = samples
     soft = ground.deformable[semantic]
     carried = depth - soft * sinkage.clamp(min=LEAST_YIELD)[:, None]
     share = torch.softmax(carried / SHARED_DEPTH, dim=1)

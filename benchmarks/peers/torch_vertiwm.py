@@ -2,8 +2,9 @@
 
 from dataclasses import fields
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
+import jax.numpy as jnp
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -20,7 +21,7 @@ from vertiwm_jax.world_model.model import ModelConfig, VertiWM, VertiWMParams
 from vertiwm_jax.world_model.normalisation import LOCAL
 from vertiwm_jax.world_model.step_features import DEPTH, FIRM, LARGEST, TRAVEL, StepFeatures
 
-_SHIPPED = ModelConfig(encoders="shared").build()
+_SHIPPED = ModelConfig(encoders="shared")
 _WHEEL_FEATURES = 14
 _GROUPS = torch.tensor([0, 0, 1, 2, 2, 3])
 _LOCAL = tensor(LOCAL)
@@ -47,8 +48,8 @@ class TorchVertiWM(nn.Module):
     def __init__(self, model: VertiWM, params: VertiWMParams):
         """Raises `ValueError` for a model of another form than the one that ships."""
         super().__init__()
-        if model != _SHIPPED:
-            raise ValueError(f"model: expected {_SHIPPED}, found {model}")
+        if model != _SHIPPED.build():
+            raise ValueError(f"model: expected {_SHIPPED.build()}, found {model}")
         transformer, nesam = params.transformer, params.nesam
         size = _SHIPPED.transformer.size
         self.elevation = Encoder(transformer.encoders.elevation["params"])
@@ -78,27 +79,20 @@ class TorchVertiWM(nn.Module):
             transformer=self.transformer.empty_cache(batch),
             nesam=self.nesam.empty_cache(2 * batch),
             memory=self.simulator.init(ground, state),
-            expected=state,
+            expected=state.clone(),
             hidden=torch.zeros(batch, HIDDEN),
-            latent=self._look(ground, state),
+            latent=self.look(ground, state),
         )
 
     def step(
         self, ground: Ground, history: History, state: Tensor, command: Tensor
     ) -> tuple[Tensor, History]:
         """States `[B, 12]` and commands `[B, 2]` to the next states; caches change in place."""
-        first, transformer = self._by_transformer(history, state, command)
-        second, physics, memory, nesam = self._by_nesam(ground, history, state, command)
-        increments = motion.increment(state, first), motion.increment(state, second)
-        apart = increments[1] - increments[0]
-        seen = history.latent.mean((-2, -1))
-        context = torch.cat([seen, state, command, increments[1], increments[0], apart], dim=-1)
-        outputs, hidden = self.gate((context - self.gate_mean) * self.gate_scale, history.hidden)
-        # Planar and vertical motion, tilt and yaw share a coefficient each.
-        beta = (0.5 + 1.5 * torch.tanh(outputs))[:, _GROUPS]
-        twist = first[:, 6:] + beta * (second[:, 6:] - first[:, 6:])
-        state = motion.moved(state, increments[0] + beta * apart, twist)
-        latent = self._look(ground, state)
+        first, transformer = self.by_transformer(history, state, command)
+        physics, memory = self.simulator.step(ground, history.memory, state, command)
+        second, nesam = self.by_nesam(history, state, command, physics, memory)
+        state, hidden = self.fuse(history, state, command, first, second)
+        latent = self.look(ground, state)
         return state, History(transformer, nesam, memory, physics, hidden, latent)
 
     def rollout(self, worlds: Ground, world: Tensor, state: Tensor, commands: Tensor) -> Tensor:
@@ -111,11 +105,29 @@ class TorchVertiWM(nn.Module):
             states.append(state)
         return torch.stack(states, dim=1)
 
-    def _look(self, ground: Ground, state: Tensor) -> Tensor:
+    def compiled(self) -> Self:
+        """Itself with every part through `torch.compile`.
+
+        Apart, because sub-steps are alike: one graph of a step holds five of them, and compiles
+        for more than nine minutes instead of a few.
+        """
+        for owner, name in (
+            (self, "look"),
+            (self, "by_transformer"),
+            (self.simulator, "substep"),
+            (self, "by_nesam"),
+            (self, "fuse"),
+        ):
+            part = torch.compile(getattr(owner, name), fullgraph=True, dynamic=False)
+            setattr(owner, name, part)
+        return self
+
+    def look(self, ground: Ground, state: Tensor) -> Tensor:
+        """The encoded ground `[B, 36, 16, 16]` at states `[B, 12]`."""
         elevation, colours = patches(ground, state)
         return torch.cat([self.elevation(elevation), self.semantic(colours)], dim=1)
 
-    def _by_transformer(
+    def by_transformer(
         self, history: History, state: Tensor, command: Tensor
     ) -> tuple[Tensor, Cache]:
         """The next state `[B, 12]` as the Transformer has it."""
@@ -131,17 +143,29 @@ class TorchVertiWM(nn.Module):
         transition = scale.transition_mean + scale.transition_deviation * output
         return motion.advance(state, transition), cache
 
-    def _by_nesam(
-        self, ground: Ground, history: History, state: Tensor, command: Tensor
-    ) -> tuple[Tensor, Tensor, Memory, Cache]:
-        """The next state `[B, 12]` as NeSAM has it, and as physics alone."""
-        physics, memory = self.simulator.step(ground, history.memory, state, command)
+    def by_nesam(
+        self, history: History, state: Tensor, command: Tensor, physics: Tensor, memory: Memory
+    ) -> tuple[Tensor, Cache]:
+        """The next state `[B, 12]` as NeSAM has it, who corrects that of physics."""
         seen = self._features(history.expected, state, command, physics, memory)
         mirrored = self.mirror_signs * seen[:, self.mirror_places]
         outputs, cache = self.nesam(torch.cat([seen, mirrored]), None, history.nesam)
         straight, turned = outputs.chunk(2)
         correction = self.correction_scale * 0.5 * (straight + self.motion_signs * turned)
-        return motion.corrected(physics, correction), physics, memory, cache
+        return motion.corrected(physics, correction), cache
+
+    def fuse(
+        self, history: History, state: Tensor, command: Tensor, first: Tensor, second: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The next state `[B, 12]` from the Transformer's and NeSAM's, and the gate's memory."""
+        by_first, by_second = motion.increment(state, first), motion.increment(state, second)
+        apart, seen = by_second - by_first, history.latent.mean((-2, -1))
+        context = torch.cat([seen, state, command, by_second, by_first, apart], dim=-1)
+        outputs, hidden = self.gate((context - self.gate_mean) * self.gate_scale, history.hidden)
+        # Planar and vertical motion, tilt and yaw share a coefficient each.
+        beta = (0.5 + 1.5 * torch.tanh(outputs))[:, _GROUPS]
+        twist = first[:, 6:] + beta * (second[:, 6:] - first[:, 6:])
+        return motion.moved(state, by_first + beta * apart, twist), hidden
 
     def _features(
         self, expected: Tensor, state: Tensor, command: Tensor, physics: Tensor, memory: Memory
@@ -184,8 +208,8 @@ def constants(struct: Any) -> Any:
 
 def _mirror() -> tuple[Tensor, Tensor]:
     """Signs and places `[91]` of what a mirror makes of features, found by mirroring places."""
-    places = np.arange(1, step_features.SIZE + 1)
-    body, wheels = np.split(places, [step_features.SIZE - WHEELS * _WHEEL_FEATURES])
+    places = jnp.arange(1, step_features.SIZE + 1)
+    body, wheels = jnp.split(places, [step_features.SIZE - WHEELS * _WHEEL_FEATURES])
     seen = StepFeatures(body, wheels.reshape(WHEELS, -1)).mirrored
     mirrored = np.concatenate([seen.body, np.ravel(seen.wheels)])
     return tensor(np.sign(mirrored).astype(np.float32)), tensor(np.abs(mirrored) - 1).long()

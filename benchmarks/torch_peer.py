@@ -1,0 +1,169 @@
+"""Steps of Verti-WM a second, beside PyTorch's, which first has to arrive at the same states."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import torch
+
+from benchmarks._harness import Figures, measure, parser, report, usable_threads
+from benchmarks.peers.torch_query import Ground, tensor
+from benchmarks.peers.torch_vertiwm import TorchVertiWM
+from vertiwm_jax.dynamics import rollout
+from vertiwm_jax.mechanics.kinematic import rest_on_ground
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain import worlds
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.worlds import WorldConfig
+from vertiwm_jax.world_model.model import VertiWM, VertiWMParams
+
+BATCHES = (20, 256)
+STEPS = 16
+WORLDS = 9
+"""Rigid, soft and mixed ones, each flat, middling and steep."""
+ONE_STEP = 1e-4
+"""Most that positions may be apart after one step, m."""
+ALL_STEPS = 2e-3
+"""The same after all steps, for `NEARLY_ALL`: a wheel that touches an edge a little earlier drives
+on from there."""
+NEARLY_ALL = 0.98
+Way = Literal["eager", "compiled"]
+Roll = Callable[[], jax.Array | torch.Tensor]
+
+
+class Drives(NamedTuple):
+    """worlds `[B]` of a map; vehicles that stand or roll, leaves `[B, 3]`; commands `[B, T]`."""
+
+    terrain: TerrainMap
+    worlds: jax.Array
+    starts: VehicleState
+    commands: Command
+
+    @classmethod
+    def draw(cls, batch: int, steps: int) -> "Drives":
+        """Random ones, from 0 to 3 m/s."""
+        terrain = worlds.generate(jax.random.split(jax.random.key(0), WORLDS), WorldConfig())
+        vehicle, keys = hmmwv(), jax.random.split(jax.random.key(1), 5)
+        world = jnp.arange(batch) % WORLDS
+
+        def place(world: jax.Array, xy: jax.Array, yaw: jax.Array, speed: jax.Array):
+            position, rpy = rest_on_ground(
+                *(terrain.select(world), xy, yaw),
+                *(vehicle.wheelbase, vehicle.track, vehicle.wheel_radius),
+            )
+            return VehicleState(position, rpy, jnp.zeros(3).at[0].set(speed), jnp.zeros(3))
+
+        starts = jax.jit(jax.vmap(place))(
+            world,
+            jax.random.uniform(keys[0], (batch, 2), minval=-40.0, maxval=40.0),
+            jax.random.uniform(keys[1], (batch,), minval=-jnp.pi, maxval=jnp.pi),
+            jax.random.uniform(keys[2], (batch,), maxval=3.0),
+        )
+        commands = Command(
+            speed=jax.random.uniform(keys[3], (batch, steps), maxval=4.0),
+            steering=jax.random.uniform(keys[4], (batch, steps), minval=-0.3, maxval=0.3),
+        )
+        return cls(terrain, world, starts, commands)
+
+
+def ours(model: VertiWM, params: VertiWMParams, drives: Drives) -> Roll:
+    """A rollout of all drives, states `[B, T, 12]`, as one program."""
+
+    def drive(
+        params: VertiWMParams,
+        terrain: TerrainMap,
+        world: jax.Array,
+        start: VehicleState,
+        commands: Command,
+    ) -> jax.Array:
+        ground = terrain.select(world)
+        history = model.init(params, ground, start)
+        return rollout(model, params, ground, history, start, commands).vector
+
+    many = jax.jit(jax.vmap(drive, in_axes=(None, None, 0, 0, 0)))
+    return lambda: many(params, *drives)
+
+
+def theirs(model: TorchVertiWM, drives: Drives) -> Roll:
+    """The same by PyTorch."""
+    ground, world = Ground.of(drives.terrain), tensor(drives.worlds).long()
+    start, commands = tensor(drives.starts.vector), tensor(drives.commands.vector)
+
+    def roll() -> torch.Tensor:
+        with torch.inference_mode():
+            return model.rollout(ground, world, start, commands)
+
+    return roll
+
+
+def agreement(ours: np.ndarray, theirs: np.ndarray) -> Figures:
+    """How far positions of states `[B, T, 12]` are apart, m; `ValueError` if it is too far."""
+    apart = np.linalg.norm(ours[..., :3] - theirs[..., :3], axis=-1)
+    first, last = apart[:, 0], apart[:, -1]
+    close = np.mean(last <= ALL_STEPS)
+    # Written so that a NaN does not agree.
+    if not (np.all(first <= ONE_STEP) and close >= NEARLY_ALL):
+        raise ValueError(
+            f"torch_peer: expected all positions within {ONE_STEP:g} m after one step and "
+            f"{NEARLY_ALL:.0%} within {ALL_STEPS:g} m after {apart.shape[1]}, found "
+            f"{first.max():.2g} m and {close:.1%}"
+        )
+    return {
+        "one_step_largest_m": float(first.max()),
+        "median_m": float(np.median(last)),
+        "largest_m": float(last.max()),
+    }
+
+
+def rates(ways: Sequence[Way], batch: int, repeats: int) -> dict[str, Figures]:
+    """Steps a second at one batch, once they are known to be the same steps."""
+    drives = Drives.draw(batch, STEPS)
+    model, params = VertiWM.pretrained()
+    rolls = {"vertiwm_jax": ours(model, params, drives)}
+    for way in ways:
+        peer = TorchVertiWM(model, params)
+        rolls[f"torch, {way}"] = theirs(peer.compiled() if way == "compiled" else peer, drives)
+
+    states, first_calls = {}, {}
+    for name, roll in rolls.items():
+        start = time.perf_counter()
+        states[name] = np.asarray(roll())
+        first_calls[name] = time.perf_counter() - start
+    reference = states["vertiwm_jax"]
+    agreements = {name: agreement(reference, states[name]) for name in rolls}
+
+    results, ours_s = {}, 0.0
+    for name, roll in rolls.items():
+        figures = measure(roll, repeats=repeats)
+        ours_s = ours_s or figures["median_s"]
+        results[f"{name}, batch {batch}"] = {
+            "steps_per_s": batch * STEPS / figures["median_s"],
+            "ours_times_faster": figures["median_s"] / ours_s,
+            **figures,
+            "first_call_s": first_calls[name],
+            **agreements[name],
+        }
+    return results
+
+
+def main() -> None:
+    arguments = parser(__doc__)
+    arguments.add_argument("--ways", nargs="+", choices=get_args(Way), default=get_args(Way))
+    arguments.add_argument("--batches", nargs="+", type=int, default=BATCHES)
+    arguments.add_argument("--repeats", type=int, default=10, help="timed rollouts, at least")
+    chosen = arguments.parse_args()
+    torch.set_num_threads(usable_threads())
+    results: dict[str, Figures] = {}
+    for batch in chosen.batches:
+        results |= rates(chosen.ways, batch, chosen.repeats)
+    threads = torch.get_num_threads()
+    also = {"torch": torch.__version__, "torch_threads": threads}
+    report("torch_peer", results, chosen.json, also)
+
+
+if __name__ == "__main__":
+    main()
