@@ -25,12 +25,11 @@ BATCHES = (20, 256)
 STEPS = 16
 WORLDS = 9
 """Rigid, soft and mixed ones, each flat, middling and steep."""
-ONE_STEP = 1e-4
-"""Most that positions may be apart after one step, m."""
-ALL_STEPS = 2e-3
-"""The same after all steps, for `NEARLY_ALL`: a wheel that touches an edge a little earlier drives
-on from there."""
-NEARLY_ALL = 0.98
+ONE_STEP, ALL_STEPS = 1e-4, 2e-3
+"""Most that positions may be apart after one step and after all of them, m, of `NEARLY_ALL`."""
+NEARLY_ALL = 0.95
+"""Where a wheel meets an edge a rounding earlier, the vehicle drives on from there."""
+ROUNDING = 2**-23
 Way = Literal["eager", "compiled"]
 Roll = Callable[[], jax.Array | torch.Tensor]
 
@@ -90,8 +89,11 @@ def ours(model: VertiWM, params: VertiWMParams, drives: Drives) -> Roll:
 
 def theirs(model: TorchVertiWM, drives: Drives) -> Roll:
     """The same by PyTorch."""
-    ground, world = Ground.of(drives.terrain), tensor(drives.worlds).long()
-    start, commands = tensor(drives.starts.vector), tensor(drives.commands.vector)
+    # Inference tensors from the start: compiled code is specialised to what it is given first.
+    with torch.inference_mode():
+        ground, world = Ground.of(drives.terrain), tensor(drives.worlds).long()
+        start = tensor(drives.starts.vector).clone()
+        commands = tensor(drives.commands.vector).clone()
 
     def roll() -> torch.Tensor:
         with torch.inference_mode():
@@ -100,23 +102,29 @@ def theirs(model: TorchVertiWM, drives: Drives) -> Roll:
     return roll
 
 
-def agreement(ours: np.ndarray, theirs: np.ndarray) -> Figures:
-    """How far positions of states `[B, T, 12]` are apart, m; `ValueError` if it is too far."""
+def distances(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
+    """How far apart positions of states `[B, T, 12]` are, m; a NaN is infinitely far."""
     apart = np.linalg.norm(ours[..., :3] - theirs[..., :3], axis=-1)
-    first, last = apart[:, 0], apart[:, -1]
-    close = np.mean(last <= ALL_STEPS)
-    # Written so that a NaN does not agree.
-    if not (np.all(first <= ONE_STEP) and close >= NEARLY_ALL):
-        raise ValueError(
-            f"torch_peer: expected all positions within {ONE_STEP:g} m after one step and "
-            f"{NEARLY_ALL:.0%} within {ALL_STEPS:g} m after {apart.shape[1]}, found "
-            f"{first.max():.2g} m and {close:.1%}"
-        )
+    first, last = np.where(np.isnan(apart), np.inf, apart)[:, [0, -1]].T
     return {
-        "one_step_largest_m": float(first.max()),
+        "one_step_within": float(np.mean(first <= ONE_STEP)),
+        "one_step_largest_m": float(np.max(first)),
+        "within": float(np.mean(last <= ALL_STEPS)),
         "median_m": float(np.median(last)),
-        "largest_m": float(last.max()),
+        "largest_m": float(np.max(last)),
     }
+
+
+def agreement(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
+    """`distances`, or `ValueError` if these are not the same drives."""
+    found = distances(ours, theirs)
+    least = min(found["one_step_within"], found["within"])
+    if least < NEARLY_ALL or found["largest_m"] == np.inf:
+        raise ValueError(
+            f"torch_peer: expected {NEARLY_ALL:.0%} within {ONE_STEP:g} m after one step and "
+            f"within {ALL_STEPS:g} m after all, found {found}"
+        )
+    return found
 
 
 def rates(ways: Sequence[Way], batch: int, repeats: int) -> dict[str, Figures]:
@@ -135,8 +143,12 @@ def rates(ways: Sequence[Way], batch: int, repeats: int) -> dict[str, Figures]:
         first_calls[name] = time.perf_counter() - start
     reference = states["vertiwm_jax"]
     agreements = {name: agreement(reference, states[name]) for name in rolls}
+    # How far ours gets from itself by roundings says what no other program can be asked for.
+    nudged = jax.tree.map(lambda x: x * (1 + jnp.float32(ROUNDING)), drives.starts)
+    itself = np.asarray(ours(model, params, drives._replace(starts=nudged))())
 
-    results, ours_s = {}, 0.0
+    results: dict[str, Figures] = {}
+    ours_s = 0.0
     for name, roll in rolls.items():
         figures = measure(roll, repeats=repeats)
         ours_s = ours_s or figures["median_s"]
@@ -147,7 +159,8 @@ def rates(ways: Sequence[Way], batch: int, repeats: int) -> dict[str, Figures]:
             "first_call_s": first_calls[name],
             **agreements[name],
         }
-    return results
+    case = f"vertiwm_jax, starts a rounding away, batch {batch}"
+    return results | {case: distances(reference, itself)}
 
 
 def main() -> None:

@@ -26,22 +26,14 @@ class Encoder(nn.Module):
     def __init__(self, weights: Weights):
         super().__init__()
         planes, _, latent = weights["cell_kernel"].shape
-        cells = tensor(weights["cell_kernel"]).view(planes, CELL_PIXELS, CELL_PIXELS, latent)
-        self.cells = _convolution(
-            cells.permute(1, 2, 0, 3), tensor(weights["cell_bias"]), stride=CELL_PIXELS
-        )
-        shrink, mix = (
-            [tensor(weights[name][part]) for part in ("kernel", "bias")]
-            for name in ("Conv_0", "Conv_1")
-        )
-        self.shrink = _convolution(*shrink, stride=2)
-        self.mix = _convolution(*mix, padding=1)
+        cells = np.reshape(weights["cell_kernel"], (planes, CELL_PIXELS, CELL_PIXELS, latent))
+        self.cells = _convolution(cells.transpose(1, 2, 0, 3), weights["cell_bias"], CELL_PIXELS)
+        self.shrink = _convolution(weights["Conv_0"]["kernel"], weights["Conv_0"]["bias"], 2)
+        self.mix = _convolution(weights["Conv_1"]["kernel"], weights["Conv_1"]["bias"], 1, 1)
         # pixel_shuffle has the places of a block innermost, flax's kernel has them outermost.
-        kernel, bias = (
-            tensor(weights["expand"][name]).unflatten(-1, (4, latent)).transpose(-1, -2).flatten(-2)
-            for name in ("kernel", "bias")
-        )
-        self.expand = _convolution(kernel[None, None], bias)
+        places = np.arange(4 * latent).reshape(4, latent).T.ravel()
+        kernel, bias = weights["expand"]["kernel"], weights["expand"]["bias"]
+        self.expand = _convolution(kernel[None, None, :, places], bias[places])
 
     def forward(self, patch: Tensor) -> Tensor:
         """`[B, channels, 128, 128]` to `[B, 18, 16, 16]`."""
@@ -170,11 +162,12 @@ def _linear(weights: Weights) -> nn.Linear:
     return made
 
 
-def _convolution(kernel: Tensor, bias: Tensor, stride: int = 1, padding: int = 0) -> nn.Conv2d:
+def _convolution(kernel: Any, bias: Any, stride: int = 1, padding: int = 0) -> nn.Conv2d:
     """From flax's kernel, `[height, width, in, out]`."""
-    kernel = kernel.permute(3, 2, 0, 1).contiguous()
-    made = nn.Conv2d(kernel.shape[1], kernel.shape[0], kernel.shape[2], stride, padding)
-    made.weight, made.bias = nn.Parameter(kernel), nn.Parameter(bias)
+    side, _, planes, features = kernel.shape
+    made = nn.Conv2d(planes, features, side, stride, padding)
+    made.weight = nn.Parameter(tensor(kernel).permute(3, 2, 0, 1).contiguous())
+    made.bias = nn.Parameter(tensor(bias))
     return made
 
 

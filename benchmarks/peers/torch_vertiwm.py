@@ -106,13 +106,13 @@ class TorchVertiWM(nn.Module):
         return torch.stack(states, dim=1)
 
     def compiled(self) -> Self:
-        """Itself with every part through `torch.compile`.
+        """Itself with its parts through `torch.compile`, but for the look at the ground.
 
         Apart, because sub-steps are alike: one graph of a step holds five of them, and compiles
-        for more than nine minutes instead of a few.
+        for more than nine minutes instead of a few. PyTorch's own `grid_sample` and convolutions
+        are faster than what the compiler makes of them.
         """
         for owner, name in (
-            (self, "look"),
             (self, "by_transformer"),
             (self.simulator, "substep"),
             (self, "by_nesam"),
