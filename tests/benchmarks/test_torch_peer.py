@@ -28,11 +28,9 @@ def drives():
 def states(drives):
     """`[B, T, 12]` of ours and of PyTorch's."""
     model, params = VertiWM.pretrained()
-    rolls = (
-        torch_peer.ours(model, params, drives),
-        torch_peer.theirs(TorchVertiWM(model, params), drives),
-    )
-    return tuple(np.asarray(roll()) for roll in rolls)
+    ours = torch_peer.ours(model, params)(drives)
+    theirs = torch_peer.theirs(TorchVertiWM(model, params), drives)()
+    return np.asarray(ours), np.asarray(theirs)
 
 
 def test_the_drives_are_on_ground_of_every_kind():
@@ -48,7 +46,7 @@ def test_one_step_is_the_same_in_every_component(states):
 
 def test_a_few_steps_are_the_same(states):
     figures = torch_peer.agreement(*states)
-    assert figures["largest_m"] < 2e-4
+    assert figures["last_largest_m"] < 2e-4
     ours, theirs = states
     np.testing.assert_allclose(theirs, ours, atol=1e-2)
 
