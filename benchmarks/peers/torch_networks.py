@@ -16,8 +16,10 @@ from vertiwm_jax.world_model.specialist_network import WINDOW
 
 Weights = Mapping[str, Any]
 """What flax calls the parameters of a module."""
-PERIODS_A_WINDOW = 16
+_PERIODS_A_WINDOW = 16
+"""As `networks.transformer` has it."""
 _NORM_EPSILON = 1e-6
+"""Flax's."""
 
 
 class Encoder(nn.Module):
@@ -95,8 +97,7 @@ class SpecialistNetwork(nn.Module):
         super().__init__()
         self.size, blocks = size, weights["transformer"]
         self.embed = _linear(weights["embed"])
-        self.sees = "reduce" in weights
-        if self.sees:
+        if "reduce" in weights:
             self.reduce = _linear(weights["reduce"])
             self.embed_ground = _linear(weights["embed_ground"])
         self.blocks = nn.ModuleList(
@@ -104,7 +105,7 @@ class SpecialistNetwork(nn.Module):
         )
         self.norm = _norm(blocks["norm"])
         self.head = _linear(weights["head"])
-        period = PERIODS_A_WINDOW * WINDOW
+        period = _PERIODS_A_WINDOW * WINDOW
         frequencies = np.geomspace(period / (2 * math.pi), 1.0, size.width // size.heads // 2)
         cycles = np.rint(frequencies).astype(np.int64)
         angle = np.arange(period)[:, None] * cycles % period * (2 * math.pi / period)
