@@ -29,7 +29,7 @@ WORLDS = 9
 ONE_STEP, ALL_STEPS = 1e-4, 2e-3
 """Most that positions may be apart after one step and after all of them, m, of `NEARLY_ALL`."""
 NEARLY_ALL = 0.95
-"""Where a wheel meets an edge a rounding earlier, the vehicle drives on from there."""
+"""19 of 20: contact jumps, and roundings alone carry a few vehicles of ours as far from itself."""
 ROUNDING = 2**-23
 _OURS = "vertiwm_jax"
 Way = Literal["eager", "compiled"]
