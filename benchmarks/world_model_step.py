@@ -33,10 +33,6 @@ def parts(batch: int) -> dict[str, Part]:
     start = jax.jit(jax.vmap(lambda state: model.init(params, terrain, state)))
     state, history = jax.jit(jax.vmap(step))(start(states), states, command)
 
-    def look(state: Any) -> Any:
-        return transformer.exteroception.query(terrain, state)
-
-    patches = jax.jit(jax.vmap(look))(state)
     first, second = (
         jax.jit(jax.vmap(lambda m, s, c, one=one, p=p: one.propose(p, terrain, m, s, c)[0]))(
             memory, state, command
@@ -61,10 +57,7 @@ def parts(batch: int) -> dict[str, Part]:
 
     driven = (state, command)
     return {
-        "map query: heights": (lambda state: look(state).elevation, (state,)),
-        "map query: colours": (lambda state: look(state).rgb, (state,)),
-        "encoders": (lambda seen: transformer.exteroception.encode(encoders, seen), (patches,)),
-        "query and encoders together": (
+        "map query and encoders": (
             lambda state: transformer.exteroception.look((encoders,), terrain, state),
             (state,),
         ),
@@ -94,12 +87,13 @@ def ceilings() -> dict[str, float]:
 def cost(part: Part, batch: int) -> tuple[float, float]:
     """FLOPs of one vehicle, and bytes that it reads and leaves, at least.
 
-    The compiler counts the operations of a loop once; physics has no other than its sub-steps.
+    The compiler counts the operations of a loop once: those of physics are of one sub-step.
     """
     function, arguments = part
-    flops = jax.jit(jax.vmap(function)).lower(*arguments).compile().cost_analysis()["flops"]
+    alone = jax.tree.map(lambda x: x[0], arguments)
+    flops = jax.jit(function).lower(*alone).compile().cost_analysis()["flops"]
     leaves = jax.tree.leaves((arguments, jax.eval_shape(jax.vmap(function), *arguments)))
-    return flops / batch, sum(leaf.size * leaf.dtype.itemsize for leaf in leaves) / batch
+    return flops, sum(leaf.size * leaf.dtype.itemsize for leaf in leaves) / batch
 
 
 def figures(batch: int) -> dict[str, Figures]:
