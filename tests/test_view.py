@@ -1,6 +1,7 @@
 """The command that shows drives, from end to end."""
 
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -66,6 +67,14 @@ def test_a_policy_on_a_held_out_task(tmp_path, capsys):
     assert "drive: is of a file" in refusal(view.main, *argv, "--drive", 0)
     (tmp_path / "checkpoints" / "1").rename(tmp_path / "gone")
     assert "expected checkpoints of a training" in refusal(view.main, *argv)
+
+
+def test_without_rerun(tmp_path, monkeypatch):
+    path = recordings.write(tmp_path)
+    monkeypatch.delitem(sys.modules, "vertiwm_jax.viewing.recording", raising=False)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    message = refusal(view.main, path)
+    assert "drive-0.rrd: expected" in message and '"vertiwm-jax[view]"' in message
 
 
 def test_what_cannot_be_shown_is_named(uniform, tmp_path, capsys):

@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from vertiwm_jax.evaluate import training
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.ground import Suite
 from vertiwm_jax.runs import RunError
-from vertiwm_jax.viewing import driven, movie, recorded, recording
+from vertiwm_jax.viewing import driven, movie, recorded
 from vertiwm_jax.viewing.scene import Scene
 from vertiwm_jax.world_model.choice import ModelName, choose
 
@@ -74,16 +74,30 @@ def main(argv: Sequence[str] | None = None) -> None:
 def view(command: View) -> Path:
     """Writes what was asked for, as a whole or not at all; the file."""
     of_run = command.source.is_dir()
-    form = movie if command.movie else recording
     path = command.movie or command.output or (_beside_run if of_run else _beside_file)(command)
-    form.check(path)
+    write = _writer(command, path)
     try:
         scene = (_driven if of_run else _recorded)(command)
     except ValueError as error:  # what is wrong with drives, maps, or tasks on them
         sys.exit(f"error: {error}")
     print(scene.title, flush=True)
-    form.write(scene, path)
+    write(scene, path)
     return path
+
+
+def _writer(command: View, path: Path) -> Callable[[Scene, Path], None]:
+    """What writes the file; `ConfigError`, which names it, without the package for that."""
+    if command.movie:
+        movie.check(path)
+        return movie.write
+    try:
+        from vertiwm_jax.viewing.recording import write
+    except ImportError as error:
+        raise ConfigError(
+            f"{path}: expected the package rerun-sdk to write it, found: {error}; "
+            'pip install "vertiwm-jax[view]"'
+        ) from None
+    return write
 
 
 def _beside_run(command: View) -> Path:

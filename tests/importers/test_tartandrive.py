@@ -108,6 +108,29 @@ def test_trajectories(seen, stored, tmp_path):
         tartandrive.read(tmp_path / "a.pt", SETTINGS)
 
 
+def test_trajectories_that_torch_has_written(seen, tmp_path):
+    torch = pytest.importorskip("torch", reason="needs the extra `peers`")
+    count, path = len(seen.time), tmp_path / "a.pt"
+    trajectory = {
+        "action": torch.tensor(seen.command),
+        "observation": {"state": torch.tensor(state(seen, 13)), "imu": torch.zeros(count, 20, 6)},
+        "dt": torch.full((count,), 0.1),
+    }
+    torch.save(trajectory, path)
+    (log,) = tartandrive.read(path, SETTINGS)
+    np.testing.assert_allclose(log.position, seen.state[:, :3], atol=1e-9)
+    np.testing.assert_allclose(log.velocity, seen.state[:, 6:9], atol=1e-9)
+    whole = path.read_bytes()
+    for bad in (b"", b"no trajectory", whole[: len(whole) // 2]):
+        path.write_bytes(bad)
+        with pytest.raises(DataError, match=r"a.pt: expected a dictionary of observation.state"):
+            tartandrive.read(path, SETTINGS)
+    for other in ([torch.zeros(3)], {"observation": {"state": 3}}, {"more": SimpleNamespace()}):
+        torch.save(other, path)
+        with pytest.raises(DataError, match=r"a.pt: expected a dictionary of observation.state"):
+            tartandrive.read(path, SETTINGS)
+
+
 def test_trajectories_need_torch(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(DataError, match=r"a.pt: expected the package torch .* pip install torch"):

@@ -91,7 +91,7 @@ def test_plans_count_by_what_they_return(blocked, temperature):
     noise_key, key = jax.random.split(KEY)
     noise = jax.random.normal(noise_key, (16, 4, 2)).at[0].set(0.0)
     plans = jnp.clip(0.5 * noise, -1.0, 1.0)
-    imagine = jax.jit(jax.vmap(planner._imagine, (None, None, None, 0, None)))
+    imagine = jax.jit(jax.vmap(planner.imagine, (None, None, None, 0, None)))
     returns = np.asarray(imagine(params, observation, state, plans, key), float)
     weights = np.exp((returns - returns.max()) / temperature)
     expected = np.tensordot(weights / weights.sum(), plans, axes=1)

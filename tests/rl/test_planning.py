@@ -78,7 +78,7 @@ def test_a_future_is_worth_its_rewards_and_what_is_expected_at_its_end(blocked):
     driver = planner(env, correction=(0.1, -0.3), value=7.0, decisions=3)
     observation, state = env.start(params, jnp.int32(0))
     first = jnp.array([0.2, 0.3])
-    found = jax.jit(driver._imagine)(params, observation, state, first, KEY)
+    found = jax.jit(driver.imagine)(params, observation, state, first, KEY)
     repeated, total, actions = (
         ActionRepeat(env, 8, driver.base),
         0.0,
@@ -101,7 +101,7 @@ def test_nothing_is_expected_after_the_end(blocked, ending):
         state = replace(state, vehicle=replace(state.vehicle, **near))
     returns = [
         float(
-            planner(env, value=value, decisions=4)._imagine(
+            planner(env, value=value, decisions=4).imagine(
                 params, observation, state, jnp.array([1.0, 0.0]), KEY
             )
         )

@@ -1,5 +1,3 @@
-import sys
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,7 +5,6 @@ from rerun.chunk import RrdReader
 from viewing.scenes import STEPS, bare, scene
 
 from vertiwm_jax import geometry
-from vertiwm_jax.config import ConfigError
 from vertiwm_jax.viewing import recording
 from vertiwm_jax.viewing.scene import panels
 
@@ -77,12 +74,6 @@ def test_a_drive_alone(tmp_path):
     entities, _ = read(tmp_path / "bare.rrd")
     assert "world/vehicle" in entities
     assert not {"world/goal", "world/predicted", "world/predictions"} & set(entities)
-
-
-def test_without_rerun(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ConfigError, match=r'scene\.rrd: expected .*"vertiwm-jax\[view\]"'):
-        recording.write(scene(), tmp_path / "scene.rrd")
 
 
 def test_a_recording_that_fails_leaves_the_old_one(tmp_path, monkeypatch):

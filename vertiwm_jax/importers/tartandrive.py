@@ -10,6 +10,7 @@ twist of the odometry; commands are throttle and steering.
 What `numpy.savez` wrote of such a dictionary holds pickled objects, and is not read.
 """
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.learning.schema import DataError
 
 _STATE = (7, 13)
+_UNREADABLE = (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError)
+"""What torch and pickle raise at a file that is no trajectory."""
 
 
 def read(path: Path, settings: ImportSettings) -> list[Log]:
@@ -77,9 +80,7 @@ def _trajectory(path: Path, settings: ImportSettings) -> tuple[np.ndarray, ...]:
         state = trajectory["observation"][settings.tartandrive.state].double().numpy()
         command = trajectory["action"].double().numpy()
         dt = trajectory["dt"].double().numpy()
-    except OSError:
-        raise
-    except Exception as error:  # torch and pickle each have their own.
+    except (*_UNREADABLE, LookupError, AttributeError, TypeError) as error:
         raise DataError(
             f"{path}: expected a dictionary of observation.{settings.tartandrive.state}, action "
             f"and dt: {' '.join(str(error).split())}"

@@ -1,5 +1,6 @@
 """What drivers that look ahead share: a model that they imagine in, and what is imagined there."""
 
+from abc import abstractmethod
 from dataclasses import replace
 from typing import Self
 
@@ -45,6 +46,12 @@ class Future:
         return cls(observation, state, jnp.float32(1), jnp.float32(0))
 
 
+def around(usual: jax.Array, number: int, spread: float, key: jax.Array) -> jax.Array:
+    """`[number, ...]` candidates in [-1, 1] about the usual `[...]`, which is the first."""
+    noise = jax.random.normal(key, (number, *usual.shape)).at[0].set(0.0)
+    return jnp.clip(usual + spread * noise, -1.0, 1.0)
+
+
 @struct.dataclass
 class Imagining(Driver):
     """Knows a model to imagine in, which needs not be the one that the vehicle really follows.
@@ -85,11 +92,31 @@ class Imagining(Driver):
         )
         return action, replace(memory, history=history)
 
-    def imagined(
-        self, params: NavigationParams, memory: Plan, state: NavigationState
-    ) -> tuple[NavigationParams, NavigationState]:
-        """The task as it is now, inside the model."""
-        return replace(params, dynamics=self.dynamics), replace(state, history=memory.history)
+    @abstractmethod
+    def imagine(
+        self,
+        params: NavigationParams,
+        observation: jax.Array,
+        state: NavigationState,
+        candidate: jax.Array,
+        key: jax.Array,
+    ) -> jax.Array:
+        """The discounted return `[]` of a candidate, in the task inside the model."""
+
+    def returns(
+        self,
+        params: NavigationParams,
+        memory: Plan,
+        observation: jax.Array,
+        state: NavigationState,
+        candidates: jax.Array,
+        key: jax.Array,
+    ) -> jax.Array:
+        """`[N]` what candidates `[N, ...]` would return from where the vehicle is."""
+        inside = replace(params, dynamics=self.dynamics)
+        state = replace(state, history=memory.history)
+        each = jax.vmap(self.imagine, (None, None, None, 0, None))
+        return each(inside, observation, state, candidates, key)
 
     def hold(
         self, params: NavigationParams, future: Future, correction: jax.Array, key: jax.Array

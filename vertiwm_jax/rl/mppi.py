@@ -8,7 +8,7 @@ from flax import struct
 
 from vertiwm_jax.env.navigation import NavigationParams, NavigationState
 from vertiwm_jax.env.observation import distance_and_bearing
-from vertiwm_jax.rl.imagining import Future, Imagining, Plan
+from vertiwm_jax.rl.imagining import Future, Imagining, Plan, around
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.world_model.choice import ModelName
 
@@ -86,22 +86,17 @@ class MPPI(Imagining):
         """The plans' mean; what is intended after the last decision is the same again."""
         noise_key, key = jax.random.split(key)
         intended = jnp.concatenate([memory.corrections[1:], memory.corrections[-1:]])
-        shape = (self.config.candidates, *intended.shape)
-        noise = jax.random.normal(noise_key, shape).at[0].set(0.0)
-        candidates = jnp.clip(intended + self.config.spread * noise, -1.0, 1.0)
-        imagined, state = self.imagined(params, memory, state)
-        returns = jax.vmap(self._imagine, (None, None, None, 0, None))(
-            imagined, observation, state, candidates, key
-        )
+        candidates = around(intended, self.config.candidates, self.config.spread, noise_key)
+        returns = self.returns(params, memory, observation, state, candidates, key)
         weights = jax.nn.softmax(returns / self.config.temperature)
         return replace(memory, corrections=jnp.tensordot(weights, candidates, axes=1))
 
-    def _imagine(
+    def imagine(
         self,
         params: NavigationParams,
         observation: jax.Array,
         state: NavigationState,
-        corrections: jax.Array,
+        candidate: jax.Array,
         key: jax.Array,
     ) -> jax.Array:
         """The discounted return `[]` of a plan `[D, 2]` and of what is expected after it."""
@@ -110,7 +105,7 @@ class MPPI(Imagining):
             return self.hold(params, future, *inputs), None
 
         keys = jax.random.split(key, self.config.decisions)
-        future, _ = jax.lax.scan(advance, Future.of(observation, state), (corrections, keys))
+        future, _ = jax.lax.scan(advance, Future.of(observation, state), (candidate, keys))
         return future.total + future.weight * self._expected(future.state)
 
     def _expected(self, state: NavigationState) -> jax.Array:

@@ -8,7 +8,7 @@ from flax import struct
 
 from vertiwm_jax.env.navigation import NavigationParams, NavigationState
 from vertiwm_jax.env.repeat import Controller
-from vertiwm_jax.rl.imagining import Future, Imagining, Plan
+from vertiwm_jax.rl.imagining import Future, Imagining, Plan, around
 from vertiwm_jax.rl.learned import MeanAction, TwinValue, Value
 from vertiwm_jax.world_model.choice import ModelName
 
@@ -63,20 +63,16 @@ class Planner(Imagining):
         """The first action of the best imagined future."""
         noise_key, key = jax.random.split(key)
         usual = self.policy(observation)
-        noise = jax.random.normal(noise_key, (self.config.candidates, 2)).at[0].set(0.0)
-        candidates = jnp.clip(usual + self.config.spread * noise, -1.0, 1.0)
-        imagined, state = self.imagined(params, memory, state)
-        returns = jax.vmap(self._imagine, (None, None, None, 0, None))(
-            imagined, observation, state, candidates, key
-        )
+        candidates = around(usual, self.config.candidates, self.config.spread, noise_key)
+        returns = self.returns(params, memory, observation, state, candidates, key)
         return replace(memory, corrections=candidates[jnp.argmax(returns)][None])
 
-    def _imagine(
+    def imagine(
         self,
         params: NavigationParams,
         observation: jax.Array,
         state: NavigationState,
-        action: jax.Array,
+        candidate: jax.Array,
         key: jax.Array,
     ) -> jax.Array:
         """The discounted return `[]` of one action and of what the policy makes of it."""
@@ -88,5 +84,5 @@ class Planner(Imagining):
             return (future, self.policy(future.observation)), None
 
         keys = jax.random.split(key, self.config.decisions)
-        (future, _), _ = jax.lax.scan(advance, (Future.of(observation, state), action), keys)
+        (future, _), _ = jax.lax.scan(advance, (Future.of(observation, state), candidate), keys)
         return future.total + future.weight * self.value(future.observation)

@@ -1,44 +1,26 @@
 """A scene as a recording for the rerun viewer: a world in three dimensions, and plots over time."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 
 from vertiwm_jax import geometry, runs
-from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env import picture
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.terrain import query
 from vertiwm_jax.viewing.scene import WHEELS, Scene, panels
 
-if TYPE_CHECKING:
-    import rerun as rr
-
 DRIVEN, PREDICTED = (plots.line(i)[0] for i in (0, 1))
 _TYRE, _SPOKE, _CABIN, _OBSTACLE, _GOAL = "#202020", "#D0D0D0", "#A9C9DE", "#4A4A4A", "#000000"
 
 
-def check(path: Path) -> None:
-    """`ConfigError`, which names the recording, without the package rerun-sdk."""
-    try:
-        import rerun  # noqa: F401
-    except ImportError as error:
-        raise ConfigError(
-            f"{path}: expected the package rerun-sdk to write it, found: {error}; "
-            'pip install "vertiwm-jax[view]"'
-        ) from None
-
-
 def write(scene: Scene, path: Path) -> None:
-    """Writes the recording as a whole, or not at all; raises like `check`, and `RunError`."""
-    check(path)
-    import rerun as rr
-
+    """Writes the recording as a whole, or not at all; raises `RunError`."""
     with runs.new_content(path) as unfinished, rr.RecordingStream("vertiwm_jax") as stream:
         stream.set_log_time_enabled(False)
         stream.save(unfinished, _layout(scene))
@@ -49,10 +31,8 @@ def write(scene: Scene, path: Path) -> None:
         stream.disconnect()
 
 
-def _layout(scene: Scene):
+def _layout(scene: Scene) -> rrb.Blueprint:
     """The world, seen from behind the vehicle, over the plots."""
-    import rerun.blueprint as rrb
-
     yaw = scene.state[0, 5]
     eye = scene.state[0, :3] + np.array([-12 * np.cos(yaw), -12 * np.sin(yaw), 7.0])
     world = rrb.Spatial3DView(
@@ -74,8 +54,6 @@ def _layout(scene: Scene):
 
 
 def _ground(stream: rr.RecordingStream, scene: Scene) -> None:
-    import rerun as rr
-
     log = partial(stream.log, static=True, strict=True)
     terrain = scene.terrain
     elevation = np.asarray(terrain.elevation[scene.world])
@@ -123,8 +101,6 @@ def _ground(stream: rr.RecordingStream, scene: Scene) -> None:
 
 
 def _vehicle(stream: rr.RecordingStream, scene: Scene) -> None:
-    import rerun as rr
-
     poses = rr.Transform3D.columns(
         translation=scene.state[:, :3], quaternion=_quaternion(scene.state[:, 3:6])
     )
@@ -149,8 +125,6 @@ def _vehicle(stream: rr.RecordingStream, scene: Scene) -> None:
 
 def _body(scene: Scene, **style: Any) -> rr.Boxes3D:
     """Two boxes: the cabin, behind the bonnet, tells the front from the rear."""
-    import rerun as rr
-
     vehicle, heights = scene.vehicle, np.asarray(scene.vehicle.hull)[:, 2]
     low, high = heights.min(), heights.max()
     waist = (low + high) / 2
@@ -164,8 +138,6 @@ def _body(scene: Scene, **style: Any) -> rr.Boxes3D:
 
 def _wheel(stream: rr.RecordingStream, scene: Scene, i: int, entity: str) -> None:
     """Wheel `i` at its place in the body, with a spoke that tells how far it has turned."""
-    import rerun as rr
-
     radius, width = float(scene.vehicle.wheel_radius), float(scene.vehicle.wheel_width)
     turned, steered = scene.turned[:, i], scene.steering[:, i]
     attitude = np.stack([np.zeros_like(turned), turned, steered], axis=1)
@@ -186,8 +158,6 @@ def _wheel(stream: rr.RecordingStream, scene: Scene, i: int, entity: str) -> Non
 
 
 def _paths(stream: rr.RecordingStream, scene: Scene) -> None:
-    import rerun as rr
-
     log = partial(stream.log, static=True, strict=True)
     log("world/path", rr.LineStrips3D([scene.state[:, :3]], colors=_rgb(DRIVEN), radii=0.06))
     if scene.prediction:
@@ -196,8 +166,6 @@ def _paths(stream: rr.RecordingStream, scene: Scene) -> None:
 
 
 def _plots(stream: rr.RecordingStream, scene: Scene) -> None:
-    import rerun as rr
-
     for title, lines in panels(scene).items():
         for i, (name, values) in enumerate(lines.items()):
             entity, known = _entity("plots", title, name), np.isfinite(values)
@@ -209,8 +177,6 @@ def _plots(stream: rr.RecordingStream, scene: Scene) -> None:
 
 def _times(scene: Scene, shown: np.ndarray | slice = slice(None)) -> list[rr.TimeColumn]:
     """Both time lines of some of the states: steps, and seconds."""
-    import rerun as rr
-
     return [
         rr.TimeColumn("step", sequence=np.arange(scene.steps + 1)[shown]),
         rr.TimeColumn("time", duration=scene.seconds[shown]),
@@ -223,8 +189,6 @@ def _quaternion(rpy: np.ndarray) -> np.ndarray:
 
 
 def _entity(*parts: str) -> str:
-    import rerun as rr
-
     return rr.new_entity_path(list(parts))
 
 
