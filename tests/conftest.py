@@ -11,6 +11,9 @@ os.environ.setdefault(
     "--xla_cpu_use_fusion_emitters=false",
 )
 
+# So that what is shared out to devices is, also where a worker has one core.
+os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")
+
 import jax
 import pytest
 

@@ -52,7 +52,7 @@ def test_metrics_checkpoints_progress_and_the_finished_state(new_run, capsys):
     run = new_run()
     state = go(run, 10)
     out = capsys.readouterr().out
-    assert "compiling ..." in out
+    assert "compiling for 1 of 2 devices ..." in out
     assert "training 50/50" in out and "count 10" in out
     chex.assert_trees_all_equal(state, Counter(jnp.float32(11)))
     lines = runs.read_metrics(run.folder)

@@ -10,7 +10,7 @@ from typing import Literal
 import tyro
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import policy_training
+from vertiwm_jax import devices, policy_training
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.dynamics import Dynamics, Params
@@ -113,6 +113,7 @@ class Navigation:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
+    devices.use_cores()
     command = tyro.cli(
         Prediction | Navigation,
         args=argv,

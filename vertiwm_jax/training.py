@@ -13,7 +13,7 @@ from typing import Any, Protocol, TypeVar
 import jax
 import numpy as np
 
-from vertiwm_jax import checkpoints
+from vertiwm_jax import checkpoints, devices
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.runs import Run, RunError
 
@@ -49,11 +49,15 @@ class CheckpointConfig:
 
 @dataclass(frozen=True)
 class Work:
-    """What an iteration gets done, for rates and metrics, and which metrics the progress shows."""
+    """What an iteration gets done, for rates and metrics, and which metrics the progress shows.
+
+    batch: what divides the sizes of all batches that are shared out to devices; 1 for none.
+    """
 
     unit: str
     amount: int
     shown: tuple[str, ...]
+    batch: int = 1
 
 
 class TrainingError(RuntimeError):
@@ -118,14 +122,18 @@ def train(
         done, state = restored
     else:
         done, state = 0, jax.jit(algorithm.init)(data, key)
-        # Placed as a restored state is, so that both run the same program.
-        state = jax.device_put(state, jax.devices()[0])
     if done >= iterations:
         return state
 
-    print("compiling ...", flush=True)
+    mesh = devices.mesh(work.batch)
+    print(f"compiling for {mesh.size} of {jax.device_count()} devices ...", flush=True)
     start = time.perf_counter()
-    iterate = jax.jit(algorithm.iterate, donate_argnums=1).lower(data, state).compile()
+    # Between iterations every device has all, so that checkpoints do not know of devices.
+    data, state = devices.everywhere(mesh, (data, state))
+    whole = jax.tree.map(lambda leaf: leaf.sharding, state)
+    iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=(whole, None))
+    with jax.set_mesh(mesh):
+        iterate = iterate.lower(data, state).compile()
     print(f"compiled in {time.perf_counter() - start:.0f} s", flush=True)
 
     total = (iterations - done) * work.amount
@@ -154,7 +162,7 @@ def train(
             f"stopped after iteration {done} of {iterations}, all saved; "
             f"go on with --resume {run.outermost}"
         )
-    return state
+    return jax.device_put(state, jax.devices()[0])
 
 
 def _mean(values: np.ndarray) -> float | None:

@@ -31,9 +31,10 @@ class Line:
     """Linear regression on rows of data; some batches may have no finite gradient."""
 
     lost: float = 0.0
+    batch: int = 8
 
     def loss(self, params, data, key):
-        rows = jax.random.randint(key, (8,), 0, len(data))
+        rows = jax.random.randint(key, (self.batch,), 0, len(data))
         x = data[rows]
         error = x @ params["slope"] + params["offset"] - x @ SLOPE
         spoilt = jax.random.uniform(jax.random.fold_in(key, 1)) < self.lost

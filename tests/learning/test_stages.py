@@ -20,6 +20,7 @@ class Pull:
     """Draws a number to a target."""
 
     target: float = 3.0
+    batch: int = 1
 
     def loss(self, params, data, key):
         return (params - self.target) ** 2

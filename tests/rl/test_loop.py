@@ -27,7 +27,8 @@ def new_run(tmp_path):
 def go(algorithm, run, iterations, env_params=ProbeParams(), **config):
     config = LoopConfig(**{"seeds": 2, "checkpoint_every": 4, **config})
     restored = restore(algorithm, env_params, run.folder, config.seeds)
-    return train(algorithm, env_params, jax.random.key(0), run, iterations, 32, config, restored)
+    key, batch = jax.random.key(0), CONFIG.shareable
+    return train(algorithm, env_params, key, run, iterations, 32, batch, config, restored)
 
 
 def interrupt_at(monkeypatch, iteration):
@@ -65,7 +66,7 @@ def test_resumed_training_ends_with_the_same_bits(new_run, monkeypatch):
 def test_metrics_checkpoints_and_the_finished_state(new_run, capsys):
     run = new_run()
     state = go(Counting(), run, 10, jnp.float32(1), keep=2)
-    assert "compiling ..." in capsys.readouterr().out
+    assert "compiling for 1 of 2 devices ..." in capsys.readouterr().out
     chex.assert_trees_all_equal(state.count, jnp.full(2, 11.0))
     lines = runs.read_metrics(run.folder)
     assert [line["count"] for line in lines] == list(range(1, 11))

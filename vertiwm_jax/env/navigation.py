@@ -11,6 +11,7 @@ import numpy as np
 from flax import struct
 from gymnax.environments import environment, spaces
 
+from vertiwm_jax import devices
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE, Dynamics, History, Params, disagreement, embedding
 from vertiwm_jax.env import observation, tasks
 from vertiwm_jax.env.chassis import Chassis
@@ -311,7 +312,8 @@ def _make_params(
 ) -> NavigationParams:
     config = env.config
     pool = tasks.validate(pool, terrain, config.goal_radius, config.map_margin)
-    starts, start_observation = _settle(env, dynamics, terrain, pool)
+    settle = devices.shared_out(partial(_settle, env), len(pool.world))
+    starts, start_observation = settle(dynamics, terrain, pool)
     finite = np.all(np.isfinite(starts.vehicle.vector), axis=-1)
     if not finite.all():
         i = int(np.argmin(finite))
@@ -348,7 +350,9 @@ def _settle(
     standing = Command(jnp.float32(0), jnp.float32(0))
     action = env.config.action(standing)
 
-    def settle(task: Tasks) -> tuple[NavigationState, jax.Array]:
+    def settle(
+        dynamics: Params, terrain: TerrainMap, task: Tasks
+    ) -> tuple[NavigationState, jax.Array]:
         selected = terrain.select(task.world)
         vehicle = tasks.place(selected, env.config.chassis, task.start, task.yaw)
         goal = jnp.append(task.goal, query.height(selected, task.goal))
@@ -376,9 +380,5 @@ def _settle(
         return state, env._see(selected, state)
 
     # Not all at once: patches of thousands of vehicles fill gigabytes.
-    count = len(pool.world)
-    batch = min(count, _SETTLED_TOGETHER)
-    batches = -(-count // batch)
-    rows = (jnp.arange(batches * batch) % count).reshape(batches, batch)
-    settled = jax.lax.map(jax.vmap(settle), jax.tree.map(lambda x: x[rows], pool))
-    return jax.tree.map(lambda x: x.reshape(rows.size, *x.shape[2:])[:count], settled)
+    settled = devices.spread(settle, (None, None, 0), _SETTLED_TOGETHER)(dynamics, terrain, pool)
+    return devices.whole(settled)

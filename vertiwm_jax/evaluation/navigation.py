@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vertiwm_jax import devices
 from vertiwm_jax.env.driver import Driver, Policy, Reactive
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
 from vertiwm_jax.env.termination import Ending
@@ -65,7 +66,8 @@ def evaluate(
     Nothing is computed any more once the last episode has ended.
     """
     driver = policy if isinstance(policy, Driver) else Reactive(policy)
-    return _evaluate(env, int(params.max_steps_in_episode), params, driver, key)
+    program = partial(_evaluate, env, int(params.max_steps_in_episode))
+    return devices.shared_out(program, params.pool_size)(params, driver, key)
 
 
 @partial(jax.jit, static_argnames=("env", "length"))
@@ -73,7 +75,7 @@ def _evaluate(
     env: NavigationEnv, length: int, params: NavigationParams, driver: Driver, key: jax.Array
 ) -> NavigationResult:
     count = params.pool_size
-    observation, start = jax.vmap(env.start, (None, 0))(params, jnp.arange(count))
+    observation, start = devices.spread(env.start, (None, 0))(params, jnp.arange(count))
 
     def position_and_rpy(state: NavigationState) -> tuple[jax.Array, jax.Array]:
         return state.vehicle.position, state.vehicle.rpy
@@ -82,13 +84,25 @@ def _evaluate(
         lambda x: jnp.broadcast_to(x, (length + 1, *x.shape)), position_and_rpy(start)
     )
 
-    @jax.vmap
-    def decide(memory: Any, observation: jax.Array, state: NavigationState, key: jax.Array) -> Any:
+    @partial(devices.spread, in_axes=(None, None, 0, 0, 0, 0))
+    def decide(
+        driver: Driver,
+        params: NavigationParams,
+        memory: Any,
+        observation: jax.Array,
+        state: NavigationState,
+        key: jax.Array,
+    ) -> Any:
         return driver.decide(params, memory, observation, state, key)
 
-    @jax.vmap
+    @partial(devices.spread, in_axes=(None, None, 0, 0, 0, 0))
     def drive(
-        memory: Any, observation: jax.Array, state: NavigationState, key: jax.Array
+        driver: Driver,
+        params: NavigationParams,
+        memory: Any,
+        observation: jax.Array,
+        state: NavigationState,
+        key: jax.Array,
     ) -> tuple[Any, jax.Array, NavigationState]:
         key_policy, key_step = jax.random.split(key)
         action, memory = driver.act(params, memory, observation, state, key_policy)
@@ -98,7 +112,7 @@ def _evaluate(
     def advance(carry: tuple, _: None) -> tuple[tuple, None]:
         step, memory, observation, state, paths = carry
         keys = jax.random.split(jax.random.fold_in(key, step), count)
-        memory, observation, state = drive(memory, observation, state, keys)
+        memory, observation, state = drive(driver, params, memory, observation, state, keys)
         step = step + 1
         paths = jax.tree.map(lambda path, x: path.at[step].set(x), paths, position_and_rpy(state))
         return (step, memory, observation, state, paths), None
@@ -106,7 +120,7 @@ def _evaluate(
     def drive_on(carry: tuple) -> tuple:
         step, memory, observation, state, paths = carry
         keys = jax.random.split(jax.random.fold_in(deciding, step), count)
-        memory = decide(memory, observation, state, keys)
+        memory = decide(driver, params, memory, observation, state, keys)
         carry = step, memory, observation, state, paths
         return jax.lax.scan(advance, carry, length=driver.interval)[0]
 
@@ -116,7 +130,7 @@ def _evaluate(
 
     # Steps after the time limit, to fill an interval, change nothing: all episodes are over.
     deciding = jax.random.fold_in(key, length)
-    memory = jax.vmap(driver.start, (None, 0))(params, start)
+    memory = devices.spread(type(driver).start, (None, None, 0))(driver, params, start)
     carry = jnp.int32(0), memory, observation, start, paths
     # Not a `while_loop`: on CPUs XLA runs what is inside one several times slower.
     decisions = -(-length // driver.interval)
@@ -129,7 +143,7 @@ def _evaluate(
     # Row 0 is the start, which no step led to.
     counted = (jnp.arange(length)[:, None] < steps)[..., None]
     mean_tilt = jnp.sum(jnp.abs(rpy[1:]) * counted, axis=0) / jnp.maximum(steps, 1)[:, None]
-    return NavigationResult(
+    result = NavigationResult(
         ending=end.ending,
         steps=steps,
         abs_roll=mean_tilt[:, 0],
@@ -141,6 +155,7 @@ def _evaluate(
         position=jnp.swapaxes(position, 0, 1),
         rpy=jnp.swapaxes(rpy, 0, 1),
     )
+    return devices.whole(result)
 
 
 @dataclasses.dataclass(frozen=True)

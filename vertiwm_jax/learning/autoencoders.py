@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vertiwm_jax import devices
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.networks.encoder import TerrainAutoencoder
@@ -88,6 +89,10 @@ class AutoencoderProblem:
 
     config: AutoencoderConfig
 
+    @property
+    def batch(self) -> int:
+        return self.config.batch
+
     def init_params(self, key: jax.Array) -> Params:
         """Untrained networks `elevation` and `semantic`."""
         keys = dict(zip(_NETWORKS, jax.random.split(key), strict=True))
@@ -100,14 +105,15 @@ class AutoencoderProblem:
     def loss(self, params: Params, data: PatchData, key: jax.Array) -> jax.Array:
         """The mean squared error `[]` of both, on patches near recorded places."""
 
-        def one(place: Places) -> jax.Array:
-            terrain = data.terrain.select(place.world)
+        def one(params: Params, terrain: TerrainMap, place: Places) -> jax.Array:
+            terrain = terrain.select(place.world)
             patches = query.patches(terrain, place.position, place.yaw, self.config.patches)
             again = reconstruct(params, patches)
             elevation = jnp.mean((again.elevation - patches.elevation) ** 2)
             return elevation + jnp.mean((again.rgb - patches.rgb) ** 2)
 
-        return jnp.mean(jax.vmap(one)(near(data, key, self.config)))
+        places = near(data, key, self.config)
+        return jnp.mean(devices.spread(one, (None, None, 0))(params, data.terrain, places))
 
     def validate(self, params: Params, data: PatchData) -> dict[str, jax.Array]:
         """Errors of reconstruction at recorded poses; `error` is the loss there.
@@ -116,20 +122,21 @@ class AutoencoderProblem:
         share of the pixels whose reconstructed colour is nearest to that of their own class.
         """
         terrain, config = data.validation_terrain, self.config
-        palette = terrain.class_rgb.astype(jnp.float32) / 127.5 - 1
 
-        def nearest(rgb: jax.Array) -> jax.Array:
+        def nearest(terrain: TerrainMap, rgb: jax.Array) -> jax.Array:
+            palette = terrain.class_rgb.astype(jnp.float32) / 127.5 - 1
             return jnp.argmin(jnp.sum((rgb[..., None, :] - palette) ** 2, axis=-1), axis=-1)
 
-        def one(place: Places) -> tuple[jax.Array, ...]:
+        def one(params: Params, terrain: TerrainMap, place: Places) -> tuple[jax.Array, ...]:
             world = terrain.select(place.world)
             patches = query.patches(world, place.position, place.yaw, config.patches)
             again = reconstruct(params, patches)
             elevation = jnp.mean((again.elevation - patches.elevation) ** 2)
             colour = jnp.mean((again.rgb - patches.rgb) ** 2)
-            return elevation, colour, jnp.mean(nearest(again.rgb) == nearest(patches.rgb))
+            same = nearest(terrain, again.rgb) == nearest(terrain, patches.rgb)
+            return elevation, colour, jnp.mean(same)
 
-        means = jax.lax.map(one, data.validation, batch_size=config.batch)
+        means = devices.spread(one, (None, None, 0), config.batch)(params, terrain, data.validation)
         elevation, colour, accuracy = map(jnp.mean, means)
         return {
             "elevation_rms": _metres(terrain, config.patches) * jnp.sqrt(elevation),

@@ -31,6 +31,11 @@ LARGEST_SKIPPED = 0.1
 class Problem(Protocol):
     """What is fitted: a loss on random batches of data, and an error on data held out."""
 
+    @property
+    def batch(self) -> int:
+        """Rows in a batch, which devices can share."""
+        ...
+
     def loss(self, params: Params, data: Any, key: jax.Array, /) -> jax.Array:
         """The loss `[]` on the batch that the key draws."""
         ...
@@ -203,7 +208,7 @@ def fit(
         key,
         run,
         config.updates // config.updates_per_iteration,
-        Work("updates", config.updates_per_iteration, ("loss", "error")),
+        Work("updates", config.updates_per_iteration, ("loss", "error"), problem.batch),
         config.checkpoints,
         restored,
     )

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vertiwm_jax import devices
 from vertiwm_jax.dynamics import Dynamics, History, Params, warm_up
 from vertiwm_jax.learning import augment, windows
 from vertiwm_jax.learning.dataset import Drives
@@ -157,6 +158,10 @@ class WindowProblem:
     objective: Objective
     config: WindowConfig
 
+    @property
+    def batch(self) -> int:
+        return self.config.batch
+
     def loss(self, params: Params, data: WindowData, key: jax.Array) -> jax.Array:
         """The mean objective `[]` of a batch of windows."""
         draw_key, mirror_key = jax.random.split(key)
@@ -166,23 +171,26 @@ class WindowProblem:
         if self.config.mirror:
             batch = augment.mirror_some(mirror_key, batch, data.terrain)
 
-        def one(window: Windows) -> jax.Array:
-            return self.objective(params, data.terrain.select(window.world), window)
+        def one(params: Params, terrain: TerrainMap, window: Windows) -> jax.Array:
+            return self.objective(params, terrain.select(window.world), window)
 
-        return jnp.mean(jax.vmap(one)(batch))
+        return jnp.mean(devices.spread(one, (None, None, 0))(params, data.terrain, batch))
 
     def validate(self, params: Params, data: WindowData) -> dict[str, jax.Array]:
         """Position errors, m; a prediction that is not finite counts as not having moved."""
 
-        def one(window: Windows) -> tuple[jax.Array, jax.Array]:
-            terrain = data.validation_terrain.select(window.world)
+        def one(
+            params: Params, terrain: TerrainMap, window: Windows
+        ) -> tuple[jax.Array, jax.Array]:
+            terrain = terrain.select(window.world)
             predicted, _ = open_loop(self.dynamics, params, terrain, window, lambda _: None)
             truth, start = window.state[-1, :3], window.state[window.context, :3]
             error = jnp.linalg.norm(predicted.position[-1] - truth)
             lost = ~jnp.isfinite(error)
             return jnp.where(lost, jnp.linalg.norm(start - truth), error), lost
 
-        error, lost = jax.lax.map(one, data.validation, batch_size=self.config.batch)
+        all_of_them = devices.spread(one, (None, None, 0), self.config.batch)
+        error, lost = all_of_them(params, data.validation_terrain, data.validation)
         kinds = data.validation.ground == jnp.arange(len(GROUNDS))[:, None]
         means = jnp.sum(kinds * error, axis=1) / jnp.sum(kinds, axis=1)
         by_kind = {f"error_{kind}": mean for kind, mean in zip(GROUNDS, means, strict=True)}

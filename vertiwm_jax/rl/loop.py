@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar
 
 import jax
 
-from vertiwm_jax import training
+from vertiwm_jax import devices, training
 from vertiwm_jax.runs import Run
 from vertiwm_jax.training import Algorithm, CheckpointConfig, Work
 
@@ -28,7 +28,7 @@ class LoopConfig(CheckpointConfig):
 
 
 @dataclass(frozen=True)
-class _Seeds(Generic[State]):
+class Seeds(Generic[State]):
     """An algorithm with several random keys; every leaf of its state has an axis of seeds."""
 
     algorithm: Algorithm[State]
@@ -41,7 +41,9 @@ class _Seeds(Generic[State]):
         return jax.lax.map(partial(self.algorithm.init, env_params), keys)
 
     def iterate(self, env_params: Any, state: State) -> tuple[State, dict[str, jax.Array]]:
-        return jax.vmap(self.algorithm.iterate, (None, 0))(env_params, state)
+        # As many seeds on every device, or else a share of the environments of all of them.
+        each = devices.spread if self.seeds % devices.number() == 0 else jax.vmap
+        return each(self.algorithm.iterate, (None, 0))(env_params, state)
 
 
 def restore(
@@ -51,7 +53,7 @@ def restore(
 
     A checkpoint of another configuration raises `CheckpointError`.
     """
-    return training.restore(_Seeds(algorithm, seeds), env_params, folder)
+    return training.restore(Seeds(algorithm, seeds), env_params, folder)
 
 
 def train(
@@ -61,13 +63,15 @@ def train(
     run: Run,
     iterations: int,
     transitions: int,
+    batch: int,
     config: LoopConfig,
     restored: tuple[int, State] | None = None,
 ) -> State:
     """`training.train` for `config.seeds` seeds; metrics are means over those that have a value.
 
-    transitions: environment steps of one seed in one iteration, for rates and metrics.
+    transitions: environment steps of one seed in one iteration, for rates and metrics. batch: what
+        divides the sizes of its batches, for devices to share.
     """
-    work = Work("transitions", transitions * config.seeds, ("episode_return", "success"))
-    seeds = _Seeds(algorithm, config.seeds)
+    work = Work("transitions", transitions * config.seeds, ("episode_return", "success"), batch)
+    seeds = Seeds(algorithm, config.seeds)
     return training.train(seeds, env_params, key, run, iterations, work, config, restored)

@@ -14,6 +14,7 @@ import optax
 from flax import struct
 from gymnax.environments.environment import Environment
 
+from vertiwm_jax import devices
 from vertiwm_jax.networks.policy import ActionCritic, Senses, SquashedActor, twin_values
 from vertiwm_jax.rl import environments
 from vertiwm_jax.rl.environments import Environments, Experience, Metrics, Outcomes
@@ -67,6 +68,10 @@ class OffPolicyConfig(LearningConfig):
                 f"warm_up: expected num_envs, {self.num_envs}, to capacity, {self.capacity}, "
                 f"found {self.warm_up}"
             )
+
+    @property
+    def shareable(self) -> int:
+        return math.gcd(self.num_envs, self.batch)
 
 
 @struct.dataclass
@@ -298,7 +303,7 @@ class OffPolicy(Generic[Learner]):
             observations = observations.update(experience.observation)
         return replace(
             state,
-            replay=state.replay.add(rows),
+            replay=state.replay.add(devices.whole(rows)),
             returns=returns,
             observations=observations,
             environments=running,
@@ -312,7 +317,7 @@ class OffPolicy(Generic[Learner]):
 
         def update(learner: Learner, key: jax.Array) -> tuple[Learner, Metrics]:
             sample_key, learn_key = jax.random.split(key)
-            batch = state.replay.sample(sample_key, self.config.batch)
+            batch = devices.share(state.replay.sample(sample_key, self.config.batch))
             batch = replace(
                 batch,
                 observation=state.observations.normalise(batch.observation),

@@ -15,6 +15,7 @@ import optax
 from flax import struct
 from gymnax.environments.environment import Environment
 
+from vertiwm_jax import devices
 from vertiwm_jax.networks.policy import Actor, Critic, Gaussian, Senses
 from vertiwm_jax.rl import environments
 from vertiwm_jax.rl.advantages import generalised_advantages
@@ -57,6 +58,10 @@ class PPOConfig(LearningConfig):
                 f"minibatches: {self.minibatches} does not divide num_envs * num_steps = "
                 f"{self.collected}; choose a divisor, for example {divisor}"
             )
+
+    @property
+    def shareable(self) -> int:
+        return math.gcd(self.num_envs, self.collected // self.minibatches)
 
     @property
     def learning_rate_schedule(self) -> optax.Schedule:
@@ -261,7 +266,8 @@ class PPO:
             advantage=advantage,
             target=advantage + value,
         )
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+        # Minibatches have rows of all environments.
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), devices.whole(batch))
 
     def _update(
         self, env_params: Params, state: TrainState, batch: Batch, key: jax.Array
@@ -300,7 +306,7 @@ class PPO:
 
         def descend(carry: tuple[Params, optax.OptState], rows: jax.Array):
             params, optimiser_state = carry
-            minibatch = jax.tree.map(lambda x: x[rows], batch)
+            minibatch = devices.share(jax.tree.map(lambda x: x[rows], batch))
             gradients, losses = jax.grad(loss, has_aux=True)(params, minibatch)
             updates, optimiser_state = optimiser.update(gradients, optimiser_state, params)
             return (optax.apply_updates(params, updates), optimiser_state), losses

@@ -38,6 +38,11 @@ class LearningConfig:
         return self.num_envs * self.num_steps
 
     @property
+    def shareable(self) -> int:
+        """What divides the sizes of all its batches: that many devices can share them evenly."""
+        return self.num_envs
+
+    @property
     def iterations(self) -> int:
         """Iterations of the whole training."""
         return math.ceil(self.transitions / self.collected)

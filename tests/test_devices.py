@@ -1,0 +1,134 @@
+"""Shared out to two devices, results are those of one, to rounding; `conftest.py` makes them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rl.probes import ProbeParams, Target
+
+from vertiwm_jax import devices
+from vertiwm_jax.learning import dataset
+from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.learning.fitting import Fit, FitConfig, FitInputs
+from vertiwm_jax.learning.rollouts import OpenLoop, WindowConfig, WindowData, WindowProblem
+from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.rl.loop import Seeds
+from vertiwm_jax.rl.off_policy import OffPolicy
+from vertiwm_jax.rl.ppo import PPO, PPOConfig
+from vertiwm_jax.rl.sac import SAC, SACConfig
+
+OPEN = Path(__file__).parents[1] / "data" / "open"
+
+
+def devices_of(mesh, function, *args):
+    """What a compiled function gives, with batches shared out on the mesh."""
+    with jax.set_mesh(mesh):
+        return jax.jit(function)(*devices.everywhere(mesh, args))
+
+
+@pytest.fixture
+def two():
+    return devices.mesh(16)
+
+
+def test_a_mesh_has_as_many_devices_as_divide_the_batch(two):
+    assert jax.device_count() == 2 == two.size
+    assert devices.mesh(17).size == devices.mesh(8).size == devices.mesh(1).size == 1
+
+
+@pytest.mark.parametrize(("size", "at_a_time"), [(16, None), (16, 3), (7, None), (7, 2), (1, 5)])
+def test_a_spread_function_gives_what_vmap_gives(two, size, at_a_time):
+    def function(scale, x, y):
+        return {"sum": scale * x.sum() + y, "first": x[0]}
+
+    x, y = jax.random.normal(jax.random.key(0), (size, 3)), jnp.arange(size)
+    expected = jax.vmap(function, (None, 0, 0))(2.0, x, y)
+    spread = devices.spread(function, (None, 0, 0), at_a_time)
+    chex.assert_trees_all_close(spread(2.0, x, y), expected, rtol=1e-6)
+    chex.assert_trees_all_close(devices_of(two, spread, 2.0, x, y), expected, rtol=1e-6)
+
+
+def test_each_device_has_its_share_of_the_rows(two):
+    with jax.set_mesh(two):
+        program = jax.jit(devices.spread(jnp.sin, (0,), 4)).lower(jnp.zeros(64))
+    # 32 rows on each device, in eight turns of four.
+    assert "tensor<8x4xf32>" in program.as_text()
+
+
+def test_what_is_shared_out_already_is_not_shared_out_again(two):
+    inner = devices.spread(jnp.sin, (0,))
+    x = jax.random.normal(jax.random.key(0), (8, 3))
+    given = devices_of(two, devices.spread(inner, (0,)), x)
+    chex.assert_trees_all_close(given, jnp.sin(x), rtol=1e-6)
+
+
+def test_gradients_are_summed_over_devices(two):
+    def loss(weight, x):
+        return jnp.mean(devices.spread(lambda weight, x: (weight @ x) ** 2, (None, 0))(weight, x))
+
+    weight, x = jnp.arange(3.0), jax.random.normal(jax.random.key(0), (12, 3))
+    expected = jax.grad(lambda w: jnp.mean((x @ w) ** 2))(weight)
+    chex.assert_trees_all_close(devices_of(two, jax.grad(loss), weight, x), expected, rtol=1e-5)
+
+
+def test_results_of_what_is_shared_out_are_on_one_device():
+    doubled = devices.shared_out(jax.jit(devices.spread(lambda x: 2 * x, (0,))), 16)
+    result = doubled(jnp.arange(16))
+    assert result.devices() == {jax.devices()[0]}
+    np.testing.assert_array_equal(result, 2 * np.arange(16))
+
+
+PPO_CONFIG = PPOConfig(
+    transitions=512, num_envs=16, num_steps=16, minibatches=4, epochs=2, hidden=(8,)
+)
+SAC_CONFIG = SACConfig(
+    transitions=512, num_envs=16, num_steps=16, batch=32, capacity=512, warm_up=64, hidden=(8,)
+)
+ALGORITHMS = {
+    "ppo": PPO(Target(), PPO_CONFIG),
+    "sac": OffPolicy(Target(), SAC(SAC_CONFIG)),
+}
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_training_on_two_devices_is_training_on_one(two, name, seeds):
+    algorithm = Seeds(ALGORITHMS[name], seeds)
+    assert algorithm.algorithm.config.shareable == 16
+    start = jax.jit(algorithm.init)(ProbeParams(), jax.random.key(0))
+
+    def train(mesh):
+        state = start
+        for _ in range(2):
+            state, metrics = devices_of(mesh, algorithm.iterate, ProbeParams(), state)
+        return jax.device_get((jax.tree.map(random_bits, state), metrics))
+
+    chex.assert_trees_all_close(train(two), train(devices.mesh(1)), rtol=2e-4, atol=2e-5)
+
+
+def random_bits(leaf):
+    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+
+
+def test_fitting_on_two_devices_is_fitting_on_one(two):
+    config = WindowConfig(batch=16, context=2, horizon=4, validation=9)
+    drives, terrain = dataset.load([OPEN / "rigid"], "validation")
+    drives = jax.tree.map(lambda x: x[:1], replace(drives, auxiliary=Auxiliary()))
+    model, params = KinematicBicycle(), bicycle_of(hmmwv())
+    data = WindowData.of(config, (drives, terrain), (drives, terrain))
+    problem = WindowProblem(model, OpenLoop(model), config)
+    fit = Fit(problem, FitConfig(updates=4, updates_per_iteration=4, warm_up=1))
+    assert problem.batch == 16
+    inputs = FitInputs(jax.tree.map(jnp.asarray, params), data)
+    start = fit.init(inputs, jax.random.key(0))
+
+    def fitted(mesh):
+        state, metrics = devices_of(mesh, fit.iterate, inputs, start)
+        return jax.device_get((state.trained, state.best_error, metrics))
+
+    chex.assert_trees_all_close(fitted(two), fitted(devices.mesh(1)), rtol=1e-4)

@@ -1,0 +1,134 @@
+"""Batches shared out to several devices: accelerators, or the cores of a CPU.
+
+A mesh in context (`jax.set_mesh(devices.mesh(...))`) says to which. Without one, and inside of what
+is shared out already, everything is computed in one place.
+"""
+
+import contextlib
+import os
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+T = TypeVar("T")
+
+AXIS = "devices"
+"""The axis of the mesh."""
+FEWEST = 8
+"""Rows of a batch that are worth a device of their own."""
+_PATIENCE = 7 * 24 * 3600  # seconds
+
+
+def use_cores() -> None:
+    """Makes every core of a CPU a device, unless JAX has started or `JAX_NUM_CPU_DEVICES` is set.
+
+    Two devices of one core each are faster than one of two cores, whose cores wait for each other
+    after every operation (docs/performance.md).
+    """
+    affinity = getattr(os, "sched_getaffinity", None)  # of this process; Linux only
+    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    # Where another program takes one core, the others wait; after 60 s XLA would end the process.
+    for flag in ("warn_stuck", "terminate"):
+        name = f"--xla_cpu_collective_call_{flag}_timeout_seconds"
+        flags = os.environ.get("XLA_FLAGS", "")
+        if name not in flags:
+            os.environ["XLA_FLAGS"] = f"{flags} {name}={_PATIENCE}".strip()
+    if "JAX_NUM_CPU_DEVICES" not in os.environ:
+        with contextlib.suppress(RuntimeError):  # It has started: its devices are what they are.
+            jax.config.update("jax_num_cpu_devices", cores)
+
+
+def mesh(batch: int) -> Mesh:
+    """The devices for batches of this size: as many as divide it and have `FEWEST` rows or more."""
+    most = max(1, min(jax.device_count(), batch // FEWEST))
+    even = next(number for number in range(most, 0, -1) if batch % number == 0)
+    return Mesh(np.array(jax.devices()[:even]), (AXIS,), axis_types=(AxisType.Auto,))
+
+
+def everywhere(mesh: Mesh, tree: T) -> T:
+    """A pytree of arrays, of which every device has a copy."""
+    return jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def shared_out(function: Callable[..., T], batch: int) -> Callable[..., T]:
+    """A compiled function that spreads batches of this size; its results are on one device."""
+
+    def on_mesh(*args: Any) -> T:
+        over = mesh(batch)
+        with jax.set_mesh(over):
+            result = function(*everywhere(over, args))
+        return jax.device_put(result, jax.devices()[0])
+
+    return on_mesh
+
+
+def spread(
+    function: Callable[..., Any], in_axes: Sequence[int | None], at_a_time: int | None = None
+) -> Callable[..., Any]:
+    """`jax.vmap` of a function, the batch shared out to the devices.
+
+    in_axes: 0 for arguments with the axis of the batch, None for others. All arrays must be
+        arguments: what a function closes over is not on the device.
+    at_a_time: how many of the batch a device computes together at most; all its share by default.
+        A batch that does not come out even is filled up with some of its rows again.
+    """
+
+    def of_batch(*args: Any) -> Any:
+        mapped = [arg for arg, axis in zip(args, in_axes, strict=True) if axis == 0]
+        size, shares = len(jax.tree.leaves(mapped)[0]), number()
+        of_each = -(-size // shares)
+        turns = -(-of_each // (at_a_time or of_each))
+        together = -(-of_each // turns)
+        rows = np.arange(shares * turns * together) % size
+
+        def of_device(*args: Any) -> Any:
+            if turns == 1:
+                return jax.vmap(function, in_axes)(*args)
+            mapped = [arg for arg, axis in zip(args, in_axes, strict=True) if axis == 0]
+
+            def of_one(row: list[Any]) -> Any:
+                own, all_ = iter(row), zip(args, in_axes, strict=True)
+                return function(*(next(own) if axis == 0 else arg for arg, axis in all_))
+
+            return jax.lax.map(of_one, mapped, batch_size=together)
+
+        if shares > 1:
+            places = PartitionSpec(), PartitionSpec(AXIS)
+            of_device = jax.shard_map(
+                of_device,
+                in_specs=tuple(places[axis == 0] for axis in in_axes),
+                out_specs=places[1],
+                check_vma=False,
+            )
+        if len(rows) == size:
+            return of_device(*args)
+        filled = [
+            arg if axis is None else jax.tree.map(lambda x: x[rows], arg)
+            for arg, axis in zip(args, in_axes, strict=True)
+        ]
+        return jax.tree.map(lambda x: x[:size], of_device(*filled))
+
+    return of_batch
+
+
+def share(tree: T) -> T:
+    """A pytree with leaves `[B, ...]`, each device with a share of the rows; it divides B."""
+    return _placed(tree, PartitionSpec(AXIS))
+
+
+def whole(tree: T) -> T:
+    """A pytree of which every device has all."""
+    return _placed(tree, PartitionSpec())
+
+
+def number() -> int:
+    """Devices to share out to, here."""
+    around = jax.sharding.get_abstract_mesh()
+    return around.shape[AXIS] if AXIS in around.auto_axes else 1
+
+
+def _placed(tree: T, places: PartitionSpec) -> T:
+    return jax.lax.with_sharding_constraint(tree, places) if number() > 1 else tree
