@@ -14,9 +14,11 @@ from gymnax.environments import environment, spaces
 
 from benchmarks._harness import Figures, measure, parser, report
 from vertiwm_jax import config as configuration
+from vertiwm_jax import devices
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
+from vertiwm_jax.rl.loop import Seeds
 from vertiwm_jax.rl.ppo import PPO
 from vertiwm_jax.world_model.choice import ModelName
 
@@ -45,9 +47,18 @@ class IdleEnv(environment.Environment):
 
 
 def iteration(ppo: PPO, params: Any, repeat: int = 1) -> Figures:
-    state = jax.jit(ppo.init)(params, jax.random.key(0))
-    figures = measure(jax.jit(ppo.iterate), params, state, repeats=3)
-    return {"transitions_per_s": repeat * ppo.config.collected / figures["median_s"], **figures}
+    """On as many devices as a training has, and on one of them, with all cores to itself."""
+    algorithm, results = Seeds(ppo, 1), {}
+    start = jax.jit(algorithm.init)(params, jax.random.key(0))
+    for name, batch in (("", ppo.config.shareable), ("one_device_", 1)):
+        mesh = devices.mesh(batch)
+        whole, state = devices.everywhere(mesh, (params, start))
+        with jax.set_mesh(mesh):
+            figures = measure(jax.jit(algorithm.iterate), whole, state, repeats=3)
+        rate = repeat * ppo.config.collected / figures["median_s"]
+        results |= {f"{name}transitions_per_s": rate}
+        results |= figures | {"devices": mesh.size} if not name else {}
+    return results
 
 
 def of_task(name: str, model: ModelName) -> Figures:
@@ -63,6 +74,7 @@ def main() -> None:
     arguments.add_argument("--configs", nargs="+", default=("ppo", "ppo_paper"))
     arguments.add_argument("--models", nargs="+", default=("builtin", "vertiwm"))
     chosen = arguments.parse_args()
+    devices.use_cores()
     idle = environment.EnvParams(max_steps_in_episode=600)
     results = {"algorithm alone": iteration(PPO(IdleEnv(), PPOTraining().ppo), idle)}
     for name in chosen.configs:

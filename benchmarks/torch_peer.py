@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Literal, NamedTuple, get_args
 
 import jax
@@ -13,6 +12,7 @@ import torch
 from benchmarks._harness import Figures, measure, parser, report, usable_threads
 from benchmarks.peers.torch_query import Ground, tensor
 from benchmarks.peers.torch_vertiwm import TorchVertiWM
+from vertiwm_jax import devices
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.mechanics.vehicle import hmmwv
@@ -71,8 +71,8 @@ class Drives(NamedTuple):
         return cls(terrain, world, starts, commands)
 
 
-def ours(model: VertiWM, params: VertiWMParams) -> Callable[[Drives], jax.Array]:
-    """What rolls out all drives, to states `[B, T, 12]`, as one program."""
+def ours(model: VertiWM, params: VertiWMParams) -> Callable[[Drives], Roll]:
+    """What rolls out drives that it holds, to states `[B, T, 12]`, on all cores, as one program."""
 
     def drive(
         params: VertiWMParams,
@@ -85,8 +85,19 @@ def ours(model: VertiWM, params: VertiWMParams) -> Callable[[Drives], jax.Array]
         history = model.init(params, ground, start)
         return rollout(model, params, ground, history, start, commands).vector
 
-    many = jax.jit(jax.vmap(drive, in_axes=(None, None, 0, 0, 0)))
-    return lambda drives: many(params, *drives)
+    many = jax.jit(devices.spread(drive, in_axes=(None, None, 0, 0, 0)))
+
+    def holding(drives: Drives) -> Roll:
+        mesh = devices.mesh(len(drives.worlds))
+        held = devices.everywhere(mesh, (params, *drives))
+
+        def roll() -> jax.Array:
+            with jax.set_mesh(mesh):
+                return many(*held)
+
+        return roll
+
+    return holding
 
 
 def theirs(model: TorchVertiWM, drives: Drives) -> Roll:
@@ -134,7 +145,7 @@ def rates(ways: Sequence[Way], batch: int, repeats: int) -> dict[str, Figures]:
     drives = Drives.draw(batch, STEPS)
     model, params = VertiWM.pretrained()
     roll_ours = ours(model, params)
-    rolls: dict[str, Roll] = {_OURS: partial(roll_ours, drives)}
+    rolls: dict[str, Roll] = {_OURS: roll_ours(drives)}
     for way in ways:
         peer = TorchVertiWM(model, params)
         rolls[f"torch, {way}"] = theirs(peer.compiled() if way == "compiled" else peer, drives)
@@ -149,7 +160,7 @@ def rates(ways: Sequence[Way], batch: int, repeats: int) -> dict[str, Figures]:
     agreements = {name: agreement(reference, found) for name, found in states.items()}
     # How far ours gets from itself by a rounding is what no other program can be asked to beat.
     nudged = jax.tree.map(lambda x: x * (1 + jnp.float32(ROUNDING)), drives.starts)
-    itself = np.asarray(roll_ours(drives._replace(starts=nudged)))
+    itself = np.asarray(roll_ours(drives._replace(starts=nudged))())
 
     timed = {name: measure(roll, repeats=repeats) for name, roll in rolls.items()}
     results: dict[str, Figures] = {
@@ -172,6 +183,7 @@ def main() -> None:
     arguments.add_argument("--batches", nargs="+", type=int, default=BATCHES)
     arguments.add_argument("--repeats", type=int, default=10, help="timed rollouts, at least")
     chosen = arguments.parse_args()
+    devices.use_cores()
     torch.set_num_threads(usable_threads())
     results: dict[str, Figures] = {}
     for batch in chosen.batches:

@@ -28,7 +28,7 @@ def drives():
 def states(drives):
     """`[B, T, 12]` of ours and of PyTorch's."""
     model, params = VertiWM.pretrained()
-    ours = torch_peer.ours(model, params)(drives)
+    ours = torch_peer.ours(model, params)(drives)()
     theirs = torch_peer.theirs(TorchVertiWM(model, params), drives)()
     return np.asarray(ours), np.asarray(theirs)
 
