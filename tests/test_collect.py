@@ -16,6 +16,8 @@ from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.mechanics import vehicle
+from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.simulators import chrono, pilots, recording
 from vertiwm_jax.simulators.protocol import Observation, SimulatorError
 from vertiwm_jax.terrain import files
@@ -79,11 +81,11 @@ def test_drives_are_read_as_recorded(collected, maps):
 def test_going_on_is_as_if_never_stopped(collected, maps, tmp_path, monkeypatch, capsys):
     archive, left = recording.archive, []
 
-    def stopping(drives, steps, meta):
+    def stopping(drives, steps, meta, vehicle):
         if meta["world"] == 1:
             left.extend(path.name for path in (tmp_path / "drives").iterdir())
             raise KeyboardInterrupt
-        return archive(drives, steps, meta)
+        return archive(drives, steps, meta, vehicle)
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as stop:
         patch.setattr(recording, "archive", stopping)
@@ -152,7 +154,7 @@ def test_drives_that_end_early_are_tried_again(maps, monkeypatch):
 
     monkeypatch.setattr(recording, "record", short)
     command = collect.Collect(output=maps, seconds=1.0)
-    task = collect.Task(command, None, files.load(maps), world=0, drive=0)
+    task = collect.Task(command, hmmwv(), None, files.load(maps), world=0, drive=0)
     assert len(collect.record(task).control) == 3 and len(set(tried)) == 6
     with pytest.raises(SimulatorError, match="world 0: drive 0: expected a step or more"):
         collect.record(task)
@@ -186,12 +188,12 @@ def test_endings(maps, index, value, ending, length):
     states = np.zeros((6, 12))
     states[3:, index] = value
     level = files.load(maps / "map_0.npz")
-    pilot = pilots.sinusoids(np.random.default_rng(0), 5)
+    pilot = pilots.sinusoids(np.random.default_rng(0), 5, 0.3725)
     drive = recording.record(Scripted(states), level, (0, 0, 0), pilot, 5)
     assert (drive.ending, len(drive.control), len(drive.observations)) == (
         ending, length, length + 1,
     )  # fmt: skip
-    file = np.load(io.BytesIO(recording.archive([drive], 5, {"map": "a"})))
+    file = np.load(io.BytesIO(recording.archive([drive], 5, {"map": "a"}, hmmwv())))
     assert file["length"] == [length] and file["state"].shape == (1, 6, 12)
     assert json.loads(str(file["meta"]))["dt"] == 0.1
 
@@ -246,9 +248,32 @@ def test_a_policy_drives_from_goal_to_goal(maps, eyes):
         state = np.append(goal, np.zeros(9)).astype(np.float32)
     assert np.linalg.norm(np.diff(goals, axis=0), axis=-1).min() >= 20
     command = collect.Collect(output=maps, seconds=2.0)
-    task = collect.Task(command, (policy, config, eyes), collect._single(terrain, 0), 0, drive=1)
+    alone = collect._single(terrain, 0)
+    task = collect.Task(command, hmmwv(), (policy, config, eyes), alone, 0, drive=1)
     drive = collect.record(task)
     assert drive.control.shape == (20, 2) and np.all(drive.control[:, 0] == 2.5)
+
+
+def test_a_rover_drives_at_full_size(maps, tmp_path):
+    # The ground of the maps is so small to it that it is 1280 m at full size.
+    flat = terrain_map.build(np.full((129, 129), 0.3), np.full((16, 16), SAND))
+    (tmp_path / "maps").mkdir()
+    files.save(flat, tmp_path / "maps" / "map.npz")
+    run(tmp_path / "maps", tmp_path / "drives", "--vehicle", "rover", "--drives", "1")
+    drives, terrain = dataset.load(tmp_path / "drives", "train")
+    assert terrain.resolution == 10.0 and np.all(terrain.elevation == 3.0)
+    rover = vehicle.load("rover").vehicle
+    _, meta = schema.read(tmp_path / "drives" / "world_000.npz")
+    np.testing.assert_allclose(meta["vehicle"]["wheels_in_body_xy"], rover.wheel_position)
+    assert meta["scale"] == 10
+    resting = rover.wheel_radius - rover.travel_at_rest.mean()
+    np.testing.assert_allclose(drives.state[..., 2] - 3.0, resting, atol=0.15)
+    message = refusal(collect.main, "--output", tmp_path / "drives", "--worlds", tmp_path / "maps")
+    assert message.endswith("config.yaml: vehicle: expected rover as before, found hmmwv")
+    for argv in (["--vehicle", "rovr"], ["--vehicle", "rover", "--simulator", "chrono"]):
+        with pytest.raises(SystemExit) as stop:
+            collect.main(["--output", str(tmp_path / "other"), *argv])
+        assert stop.value.code
 
 
 @pytest.mark.slow

@@ -210,7 +210,9 @@ def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch
     said = capsys.readouterr().out
     assert "driving 4 tasks on 2 worlds" in said and "  straight to goal: " in said
     # The usual worlds are many.
-    monkeypatch.setattr(configuration, "default_config", lambda name: run / "config.yaml")
+    find = configuration.default_config
+    found = {"ppo": run / "config.yaml"}
+    monkeypatch.setattr(configuration, "default_config", lambda name: found.get(name) or find(name))
     evaluate.main([*navigate, "straight", "--suites", "hard", "--seed", "7"])
     text = capsys.readouterr().out
     assert "**hard**" in text and "| straight to goal" in text
@@ -220,6 +222,17 @@ def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch
     small = ["--mppi.candidates", "2", "--mppi.decisions", "1", "--mppi.model", "builtin"]
     evaluate.main([*navigate, "mppi", "--suites", "easy", *small])
     assert "| mppi" in capsys.readouterr().out
+
+
+def test_a_policy_drives_another_vehicle(run, tmp_path, capsys):
+    navigate = ("navigation", "--policy", run, "--suites", "easy", "--output")
+    evaluate.main([*map(str, navigate), str(tmp_path / "hmmwv")])
+    evaluate.main([*map(str, navigate), str(tmp_path / "rover"), "--vehicle", "rover"])
+    assert "| straight to goal" in capsys.readouterr().out
+    first, second = ((tmp_path / name / "episodes.csv").read_text() for name in ("hmmwv", "rover"))
+    assert first != second
+    message = refusal(evaluate.main, *navigate, tmp_path / "rovr", "--vehicle", "rovr")
+    assert "did you mean 'rover'" in message
 
 
 def test_training_inside_a_world_model_and_judged_in_the_simulator(train, tmp_path, capsys):
@@ -267,6 +280,13 @@ def test_predictions_of_drives(tmp_path, capsys):
     assert "4-step yaw error, deg" in text and "ground under the vehicle" in text
     for picture in ("prediction.png", "paths.png"):
         assert (out / picture).stat().st_size > 10_000
+    evaluate.main([*argv, "--models", "builtin", "--vehicle", "rover", "--output", f"{out}-rover"])
+    with (tmp_path / "tables-rover" / "prediction.csv").open() as file:
+        others = [row for row in csv.DictReader(file) if row["measure"] == "position"]
+    assert [a["mean"] != b["mean"] for a, b in zip(rows, others, strict=True)] == [
+        True, True, False,
+    ]  # fmt: skip
+    assert "rovr" in refusal(evaluate.main, *argv, "--vehicle", "rovr")
 
 
 def test_bad_drives_are_named(tmp_path, capsys):

@@ -8,6 +8,7 @@ from vertiwm_jax import config, evaluate
 from vertiwm_jax.compare import CompareConfig
 from vertiwm_jax.fit import FitConfig
 from vertiwm_jax.importers.settings import ImportSettings
+from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.ppo import PPOTraining
 
 FOLDER = Path(__file__).parents[1] / "configs"
@@ -18,7 +19,8 @@ KINDS = {"table3": CompareConfig, "import_nedm": ImportSettings} | dict.fromkeys
 
 @pytest.mark.parametrize("file", sorted(FOLDER.rglob("*.yaml")), ids=lambda file: file.stem)
 def test_every_one_can_be_read(file):
-    kind = FitConfig if file.parent.name == "rows" else KINDS.get(file.stem)
+    folders = {"rows": FitConfig, "vehicles": VehicleConfig}
+    kind = folders.get(file.parent.name, KINDS.get(file.stem))
     loaded = config.load(kind, file) if kind else evaluate.training(file)
     assert kind or loaded.name in file.stem
 

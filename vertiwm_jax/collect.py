@@ -24,6 +24,8 @@ from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env.driver import Policy
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.evaluate import training
+from vertiwm_jax.mechanics import vehicle
+from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig
 from vertiwm_jax.rl import ground
 from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.runs import Progress, RunError
@@ -38,7 +40,6 @@ from vertiwm_jax.terrain.map import MapError, TerrainMap
 from vertiwm_jax.terrain.worlds import Difficulty, Kind, WorldConfig
 from vertiwm_jax.world_model.perception import Eyes
 
-SIMULATORS = {"builtin": BuiltIn, "chrono": Chrono}
 SHORTEST = 0.8
 """Share of its time after which a drive that ended early is kept; others are tried again."""
 ATTEMPTS = 6
@@ -46,7 +47,7 @@ ATTEMPTS = 6
 
 @dataclass(frozen=True)
 class Collect:
-    """Record drives of an HMMWV in a simulator as `fit` and `evaluate` read them, a file a world.
+    """Record drives of a vehicle in a simulator as `fit` and `evaluate` read them, a file a world.
 
     The same command goes on where it was stopped: worlds whose file is there are not driven again.
     """
@@ -54,7 +55,9 @@ class Collect:
     output: Path
     """Folder for the files; their maps are in its folder `maps`."""
     simulator: Literal["builtin", "chrono"] = "builtin"
-    """What moves the vehicle; Chrono needs PyChrono."""
+    """What moves the vehicle; Chrono needs PyChrono, and has the HMMWV alone."""
+    vehicle: str = HMMWV
+    """Name of a vehicle that comes along, or a YAML file of one; drives are at its full size."""
     worlds: Path | None = None
     """A Verti-Bench checkout or a folder of .npz maps, to drive on all of them."""
     obstacles: bool = False
@@ -84,6 +87,8 @@ class Collect:
             raise ValueError(f"seconds: expected {STEP_SECONDS} or more, found {self.seconds}")
         if self.obstacles and not (self.worlds and self.simulator == "chrono"):
             raise ValueError("obstacles: are solid in Chrono alone, and are those of given worlds")
+        if self.vehicle != HMMWV and self.simulator == "chrono":
+            raise ValueError(f"vehicle: expected {HMMWV} in Chrono, found {self.vehicle}")
         WorldConfig(self.difficulties, self.kinds)
 
     @property
@@ -97,6 +102,7 @@ class Task:
     """One drive to record: number `drive` on the selected world of `terrain`, number `world`."""
 
     command: Collect
+    vehicle: Vehicle
     learned: tuple[Policy, NavigationConfig, Eyes | None] | None
     terrain: TerrainMap
     world: int
@@ -128,11 +134,12 @@ def collect(command: Collect) -> None:
     """Records what the folder lacks, a world after the other."""
     if command.simulator == "chrono":
         chrono.modules()
-    terrain, learned = _terrain(command), _learned(command.policy)
+    config = vehicle.load(command.vehicle)
+    terrain, learned = _terrain(command, config.scale), _learned(command)
     _claim(command)
     missing = [w for w in range(terrain.worlds) if not _file(command, w).exists()]
     tasks = (
-        Task(command, learned, alone, world, drive)
+        Task(command, config.vehicle, learned, alone, world, drive)
         for world in missing
         for alone in [_single(terrain, world)]
         for drive in range(command.drives)
@@ -148,7 +155,7 @@ def collect(command: Collect) -> None:
                 drives.append(drive)
                 done += len(drive.control)
                 progress.advance(command.steps, f"world {world}, drive {len(drives)}")
-            _write(command, world, _single(terrain, world), drives)
+            _write(command, config, world, _single(terrain, world), drives)
     if done:
         print(f"{done:,} steps, {done / (time.monotonic() - began):,.0f} a second")
 
@@ -160,14 +167,15 @@ def record(task: Task) -> Drive:
     """
     command, tries = task.command, []
     terrain = jax.device_put(task.terrain)
-    simulator = SIMULATORS[command.simulator](terrain)
+    chrono_drives = command.simulator == "chrono"
+    simulator = Chrono(terrain) if chrono_drives else BuiltIn(terrain, task.vehicle)
     for attempt in range(ATTEMPTS):
         rng = np.random.default_rng([command.seed, task.world, task.drive, attempt])
         start = pilots.start(rng, terrain, command.seconds)
         if task.learned:
             pilot = pilots.Learned(*task.learned, terrain, rng)
         else:
-            pilot = pilots.sinusoids(rng, command.steps)
+            pilot = pilots.sinusoids(rng, command.steps, float(task.vehicle.steering_limit))
         tries.append(recording.record(simulator, terrain, start, pilot, command.steps))
         if len(tries[-1].control) >= SHORTEST * command.steps:
             break
@@ -195,13 +203,13 @@ def _simulating(jobs: int) -> Iterator[Callable[..., Iterator[Any]]]:
         executor.shutdown(cancel_futures=True)
 
 
-def _terrain(command: Collect) -> TerrainMap:
+def _terrain(command: Collect, scale: float) -> TerrainMap:
     """All worlds to drive on."""
     if command.worlds:
-        return ground.load(GroundConfig(obstacles=command.obstacles), command.worlds)
+        return ground.load(GroundConfig(obstacles=command.obstacles), command.worlds, scale)
     config = WorldConfig(command.difficulties, command.kinds)
     count = command.repeats * len(command.difficulties) * len(command.kinds)
-    return worlds.generate(jax.random.split(jax.random.key(command.seed), count), config)
+    return worlds.generate(jax.random.split(jax.random.key(command.seed), count), config, scale)
 
 
 def _single(terrain: TerrainMap, world: int) -> TerrainMap:
@@ -211,13 +219,14 @@ def _single(terrain: TerrainMap, world: int) -> TerrainMap:
     return jax.device_get(replace(terrain, **alone))
 
 
-def _learned(run: Path | None) -> tuple[Policy, NavigationConfig, Eyes | None] | None:
+def _learned(command: Collect) -> tuple[Policy, NavigationConfig, Eyes | None] | None:
     """What the run has learned, in host memory, how it is to be driven, and what it sees by."""
+    run = command.policy
     if run is None:
         return None
-    config = training(run / "config.yaml")
+    config = replace(training(run / "config.yaml"), vehicle=command.vehicle)
     policy, eyes = jax.device_get(export.restore(config, run, seed=0))
-    return policy, config.navigation, eyes
+    return policy, config.asked, eyes
 
 
 def _claim(command: Collect) -> None:
@@ -240,18 +249,21 @@ def _file(command: Collect, world: int) -> Path:
     return command.output / f"world_{world:03d}.npz"
 
 
-def _write(command: Collect, world: int, terrain: TerrainMap, drives: list[Drive]) -> None:
+def _write(
+    command: Collect, vehicle: VehicleConfig, world: int, terrain: TerrainMap, drives: list[Drive]
+) -> None:
     """The map, and then the drives, by which a world counts as done."""
     path = _file(command, world)
     files.save(terrain, path.parent / "maps" / path.name)
     meta = {
         "map": path.name,
         "simulator": command.simulator,
+        "scale": vehicle.scale,
         "policy": str(command.policy) if command.policy else "sinusoids",
         "world": world,
         "seed": command.seed,
     }
-    runs.write_atomic(path, recording.archive(drives, command.steps, meta))
+    runs.write_atomic(path, recording.archive(drives, command.steps, meta, vehicle.vehicle))
 
 
 if __name__ == "__main__":

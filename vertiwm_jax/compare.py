@@ -87,6 +87,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     keep_compiled(config.compile_cache)
     with failures_in_one_line(ConfigError):
         settings = {row: training(config, row) for row in config.rows}
+        vehicles = {chosen.vehicle for chosen in settings.values()}
+        if len(vehicles) > 1:
+            names = " and ".join(sorted(vehicles))
+            raise ConfigError(f"{config.settings}: vehicle: expected one for all, found {names}")
         with Run.begin(config, config.name) as run:
             print(f"run folder {run.folder}", flush=True)
             folders = {row: _train(row, settings[row], run.folder) for row in config.rows}
@@ -115,10 +119,10 @@ def _judge_all(
     config: CompareConfig, settings: dict[Row, TrainConfig], folders: dict[Row, Path], output: Path
 ) -> None:
     key = task.TaskConfig(seed=config.seed).key("worlds")
-    terrain = ground.suite_worlds(config.grounds, key)
     first = settings[config.rows[0]]
+    terrain = ground.suite_worlds(config.grounds, key, first.driven.scale)
     rows = [(settings[row], _learned(row, settings[row], folders[row])) for row in config.rows]
-    rows.append((first, lambda _: baselines(first.navigation)))
+    rows.append((first, lambda _: baselines(first.asked)))
     judged = {}
     for simulator in config.simulators:
         judged[simulator] = _judge(config.grounds, rows, terrain, simulator)

@@ -42,7 +42,7 @@ class ConfigError(ValueError):
 
 
 def default_config(name: str) -> Path:
-    """The YAML file `name` (without ending) that comes with the package.
+    """The YAML file `name` (without ending; `folder/name` in a folder) that comes along.
 
     An installed wheel carries the files in the package, a checkout beside it. An unknown name
     raises `ConfigError`.
@@ -51,7 +51,8 @@ def default_config(name: str) -> Path:
         path = folder / f"{name}.yaml"
         if path.is_file():
             return path
-    known = [path.stem for folder in _FOLDERS for path in sorted(folder.glob("*.yaml"))]
+    inside, name = Path(name).parent, Path(name).name
+    known = [path.stem for folder in _FOLDERS for path in sorted((folder / inside).glob("*.yaml"))]
     raise ConfigError(f"no configuration named {name!r}: expected {_choices(name, known)}")
 
 

@@ -20,8 +20,9 @@ from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.fit import FitConfig
 from vertiwm_jax.learning import dataset
+from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.policy_training import TrainConfig
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import ground, task
@@ -51,6 +52,9 @@ class Prediction:
     """The models."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
+    vehicle: str = HMMWV
+    """What the built-in simulator and the bicycle drive: the name of a vehicle that comes along, or
+    a YAML file of one."""
     soil: SoilSource | None = None
     """Where the models have soils from, if not from where they had them when they were fitted."""
     compare: tuple[Path, ...] = ()
@@ -87,6 +91,8 @@ class Navigation:
     """How it plans, and in which model, whatever moves the vehicle."""
     simulator: ModelName | Literal["chrono"] = "builtin"
     """What moves the vehicle; Chrono needs PyChrono, and drives one task after the other."""
+    vehicle: str | None = None
+    """Name or YAML file of another vehicle than the policy's training was meant for."""
     worlds: Path | None = None
     """A Verti-Bench checkout or a folder of .npz maps, to drive on all of them."""
     obstacles: bool = False
@@ -134,10 +140,12 @@ def _predict(command: Prediction) -> None:
         test = TestWindows.of(drives, terrain, *lengths)
     except ValueError as error:  # what is wrong with the drives, or with their maps
         sys.exit(f"error: {error}")
+    driven = vehicle.load(command.vehicle).vehicle
+    chosen = command.weights, command.soil, driven
     models: dict[str, tuple[Dynamics, Params]] = {
-        **{name: choose(name, command.weights, command.soil) for name in command.models},
+        **{name: choose(name, *chosen) for name in command.models},
         **_compared(command.compare),
-        "kinematic bicycle": (KinematicBicycle(), bicycle_of(hmmwv())),
+        "kinematic bicycle": (KinematicBicycle(), bicycle_of(driven)),
         "constant velocity": (ConstantVelocity(), None),
     }
     rows = [prediction.evaluate(name, *models[name], test) for name in models]
@@ -164,18 +172,20 @@ def _navigate(command: Navigation) -> None:
     file = run / "config.yaml" if run else configuration.default_config("ppo")
     try:
         config = _adapted(training(file), command)
-        maps = command.worlds
-        terrain = ground.load(config.ground, maps) if maps else task.held_out(config)
+        if command.simulator == "chrono" and config.vehicle != HMMWV:
+            raise ConfigError(f"vehicle: expected {HMMWV} in Chrono, found {config.vehicle}")
+        maps, scale = command.worlds, config.driven.scale
+        terrain = ground.load(config.ground, maps, scale) if maps else task.held_out(config)
         model = "builtin" if command.simulator == "chrono" else command.simulator
         test = task.test_environment(config, terrain, model)
     except ValueError as error:  # what is wrong with configuration, maps, or tasks on them
         sys.exit(f"error: {error}")
-    policies = baselines(config.navigation)
+    policies = baselines(config.asked)
     if run:
         policies = policy_training.learned(config, terrain, run) | policies
     elif command.policy == "mppi":
         dynamics, weights = task.dynamics(config, command.mppi.model)
-        env = NavigationEnv(dynamics, config.navigation)
+        env = NavigationEnv(dynamics, config.asked)
         policies = {"mppi": MPPI(env=env, dynamics=weights, config=command.mppi)} | policies
     elif command.policy == "straight":
         policies = {REFERENCE: policies[REFERENCE]}
@@ -202,6 +212,8 @@ def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:
     grounds = replace(config.ground, **{name: value for name, value in asked.items() if value})
     if command.worlds:
         grounds = replace(grounds, obstacles=command.obstacles)
+    if command.vehicle is not None:
+        config = replace(config, vehicle=command.vehicle)
     if command.suites:
         config = replace(config, worlds=None)
     if command.seed is not None:

@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         record, config = _recorder(), training(command.run / "config.yaml")
         with runs.new_folder(folder) as unfinished:
             policy, eyes = restore(config, command.run, command.seed)
-            made = files(policy, eyes, config.navigation, config.action_repeat, record)
+            made = files(policy, eyes, config.asked, config.action_repeat, record)
             for name, data in made.items():
                 runs.write_atomic(unfinished / name, data)
     except (RunError, CheckpointError, ConfigError, OSError) as error:

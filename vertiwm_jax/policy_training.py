@@ -105,7 +105,7 @@ def learned(config: TrainConfig, terrain: TerrainMap, run: Path) -> Rows:
     terrain: any worlds that tests can be drawn on.
     """
     dynamics, weights = task.dynamics(config, config.model)
-    env = NavigationEnv(dynamics, config.navigation, config.variation)
+    env = NavigationEnv(dynamics, config.asked, config.variation)
     params = env.shapes(weights, terrain, ground.test_tasks(config.ground, terrain))
     algorithm = config.algorithm(env)
     restored = restore(algorithm, params, run, config.loop.seeds)
@@ -115,7 +115,7 @@ def learned(config: TrainConfig, terrain: TerrainMap, run: Path) -> Rows:
 
 
 def _base(config: TrainConfig) -> Controller | None:
-    return None if config.base == "none" else baselines(config.navigation)[config.base]
+    return None if config.base == "none" else baselines(config.asked)[config.base]
 
 
 def _policies(
@@ -131,7 +131,7 @@ def _policies(
         if config.planning:
             dynamics, weights = task.dynamics(config, config.planning.model)
             rows[f"{name} with planning"] = Planner(
-                env=NavigationEnv(dynamics, config.navigation),
+                env=NavigationEnv(dynamics, config.asked),
                 dynamics=weights,
                 policy=policy,
                 value=algorithm.value(params, of_seed),
@@ -168,7 +168,7 @@ def train_and_report(config: TrainConfig) -> Path:
             config.loop,
             restored,
         )
-        policies = _policies(config, algorithm, params, state) | baselines(config.navigation)
+        policies = _policies(config, algorithm, params, state) | baselines(config.asked)
         _draw_learning(run, config)
         with _on_usable_ground():
             test = task.test_environment(config, held_out)

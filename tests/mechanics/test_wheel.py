@@ -10,7 +10,7 @@ from scipy.integrate import quad
 
 from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
 from vertiwm_jax.mechanics.wheel import Contact, Wheel, deepen, forces, rigid_forces, slip
-from vertiwm_jax.terrain.soil import PRESETS, stack
+from vertiwm_jax.terrain.soil import PRESETS, enlarged, stack
 
 WHEEL = Wheel(0.467, 0.254)
 SOILS = stack([PRESETS[name] for name in ("sand", "heavy_clay_25", "snow_us")])
@@ -265,3 +265,15 @@ def test_forces_in_a_soft_rut_are_finite_at_every_rounding() -> None:
     out = jax.jit(forces)(wheel, soil, contact, sinkage, speed, 0.1, 1.2 * speed / 0.467, rut)
     for name, values in vars(out).items():
         assert jnp.all(jnp.isfinite(values)), name
+
+
+@pytest.mark.parametrize("name", ["sand", "heavy_clay_25", "snow_us"])
+def test_a_wheel_ten_times_as_large_meets_enlarged_soil_as_froude_says(name):
+    second, creep = 10**0.5, 0.05
+    small = run(Wheel(0.05, 0.04), PRESETS[name], Contact(creep_speed=creep), 0.004, 0.3, 0.05, 8.0)
+    contact, motion = Contact(creep_speed=second * creep), (second * 0.3, second * 0.05, 8 / second)
+    large = run(Wheel(0.5, 0.4), enlarged(PRESETS[name], 10.0), contact, 0.04, *motion)
+    for field in ("longitudinal", "lateral", "normal", "torque"):
+        factor = 1e4 if field == "torque" else 1e3
+        found, expected = getattr(large, field), factor * getattr(small, field)
+        np.testing.assert_allclose(found, expected, rtol=2e-3, err_msg=field)

@@ -112,7 +112,7 @@ def test_the_built_in_simulator_is_the_one_inside_jit():
 
     @jax.jit
     def inside(commands):
-        start = tasks.place(terrain, Chassis(), jnp.array([160.0, 5.0]), jnp.float32(1.0))
+        start = tasks.place(terrain, Chassis.of(hmmwv()), jnp.array([160.0, 5.0]), jnp.float32(1.0))
         return rollout(model, params, terrain, model.init(params, terrain, start), start, commands)
 
     commands = np.concatenate([np.zeros((15, 2), np.float32), commands])

@@ -117,3 +117,17 @@ def test_stack_names_what_differs(changes, field):
 def test_stack_of_nothing():
     with pytest.raises(MapError, match="at least one map"):
         terrain_map.stack([])
+
+
+def test_enlarged_ground_is_the_same_but_for_its_scale():
+    boxes = np.array([[1.0, 1.0, 0.1, 0.2, 0.3]])
+    small = build(obstacles=boxes, resolution=0.1, origin=(0.5, 2.0), elevation=0.1 * HEIGHTS)
+    large = terrain_map.enlarged(small, 10.0)
+    for name in ("elevation", "obstacles", "origin", "resolution"):
+        np.testing.assert_allclose(getattr(large, name), 10 * getattr(small, name), rtol=1e-6)
+    np.testing.assert_array_equal(large.elevation_range, small.elevation_range)
+    sand = STANDARD.names.index("sand")
+    assert large.soils.cohesion[sand] == 10 * small.soils.cohesion[sand]
+    assert terrain_map.enlarged(small, 1.0) is small
+    with pytest.raises(MapError, match=r"^my.npz, 20 times as large: elevation: .*\[0, 16\] m"):
+        terrain_map.enlarged(build(), 20.0, "my.npz")

@@ -1,6 +1,9 @@
 """The shape of a vehicle, as far as an environment must know it."""
 
 from dataclasses import dataclass
+from typing import Self
+
+from vertiwm_jax.mechanics.vehicle import Vehicle
 
 
 @dataclass(frozen=True)
@@ -17,3 +20,9 @@ class Chassis:
     wheelbase: float = 3.378
     track: float = 1.82
     axle_height: float = 0.47
+
+    @classmethod
+    def of(cls, vehicle: Vehicle) -> Self:
+        """That of a vehicle on its relaxed springs, or nearly so."""
+        sizes = vehicle.length, vehicle.width, vehicle.wheelbase, vehicle.track
+        return cls(*map(float, sizes), axle_height=float(vehicle.wheel_radius))

@@ -24,8 +24,9 @@ from vertiwm_jax.learning.rollouts import OneStep, OpenLoop, WindowConfig, Windo
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.learning.soils import SoilProblem
 from vertiwm_jax.learning.stages import Inputs
+from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import VehicleConfig, hmmwv
 from vertiwm_jax.runs import Run
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
@@ -71,6 +72,9 @@ class PipelineConfig:
 
     model: ModelConfig = ModelConfig()
     """What is fitted."""
+    vehicle: str | None = None
+    """Whose physics NeSAM corrects: the name of a vehicle that comes along, or a YAML file of one;
+    by default that of the model to go on from, or else the HMMWV."""
     windows: WindowConfig = WindowConfig(weights=(1.0, 1.0, 2.0))
     """Which windows of the drives."""
     loss: LossConfig = LossConfig(velocity=0.05)
@@ -87,12 +91,19 @@ class PipelineConfig:
     """What fuses the two."""
 
     def __post_init__(self):
+        if self.vehicle:
+            vehicle.load(self.vehicle)  # That it cannot be read is to be said now.
         kinds = self.transformer.learns_from, self.nesam.learns_from
         if self.model.encoders == "shared" and kinds[0] != kinds[1]:
             raise ValueError(
                 f"model.encoders: expected own ones for specialists that learn from different "
                 f"collections, {kinds[0]} and {kinds[1]}, found shared"
             )
+
+    @property
+    def driven(self) -> VehicleConfig | None:
+        """The vehicle, if one is chosen; `ConfigError` if there is no such."""
+        return vehicle.load(self.vehicle) if self.vehicle else None
 
 
 def fit(
@@ -110,12 +121,17 @@ def fit(
     open-loop predictions alone. Raises what `dataset.load`, `WindowData.of` and `fitting.fit`
     raise.
     """
+    driven = config.driven
+    if start is not None and driven is not None:
+        simulator = replace(start.nesam.simulator, vehicle=jax.device_put(driven.vehicle))
+        start = replace(start, nesam=replace(start.nesam, simulator=simulator))
     pipeline = _Pipeline(config, tuple(folders), key, run, tuple(reuse), start)
     digests: list[str] = []
     built, parts = config.model, config.model.parts
     if start is None:
         constants = normalisation.measure(pipeline.load(KINDS, "train")[0])
-        params = built.init_params(key, chrono_like(hmmwv()), constants)
+        physics = chrono_like(driven.vehicle if driven else hmmwv())
+        params = built.init_params(key, physics, constants)
     else:
         params = start
     if "nesam" in parts:
@@ -224,7 +240,10 @@ class _Pipeline:
     @property
     def _begun(self) -> tuple[str, ...]:
         """What the first stages know the parameters by that they go on from."""
-        return () if self.start is None else (stages.digest(self.start),)
+        if self.start is not None:
+            return (stages.digest(self.start),)
+        driven = self.config.driven
+        return () if driven is None else (str(driven),)
 
     def _key(self, name: str) -> jax.Array:
         return jax.random.fold_in(self.key, zlib.crc32(name.encode()))

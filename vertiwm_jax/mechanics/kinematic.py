@@ -44,14 +44,15 @@ class BicycleParams:
     speed_lag: jax.Array
 
 
-def bicycle_of(
-    vehicle: Vehicle, ride_height: float = 0.43, speed_lag: float = 0.2
-) -> BicycleParams:
-    """The bicycle with the axles of `vehicle`; the rest, m and s, as an HMMWV drives in Chrono."""
+def bicycle_of(vehicle: Vehicle, speed_lag: float = 0.2) -> BicycleParams:
+    """The bicycle with the axles of `vehicle` that rides as its springs carry it.
+
+    speed_lag: s, as an HMMWV drives in Chrono.
+    """
     return BicycleParams(
         wheelbase=jnp.asarray(vehicle.wheelbase),
         track=jnp.asarray(vehicle.track),
-        ride_height=jnp.float32(ride_height),
+        ride_height=jnp.asarray(vehicle.wheel_radius - vehicle.travel_at_rest.mean()),
         speed_lag=jnp.float32(speed_lag),
     )
 

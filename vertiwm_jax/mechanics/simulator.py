@@ -26,13 +26,12 @@ from vertiwm_jax.mechanics.newton_euler import (
 from vertiwm_jax.mechanics.scm import ScmContact, scm_forces
 from vertiwm_jax.mechanics.touch import Touch, touch
 from vertiwm_jax.mechanics.vector import Axes, Vector
-from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle
 from vertiwm_jax.mechanics.wheel import Contact, Wheel, WheelForces, forces, rigid_forces
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
 
-GRAVITY = 9.81
 ADHESION_SPEED = 0.1
 """Slip speed, m/s, at which friction has reached 70 % of its limit."""
 SPIN_FLOOR = 0.5
@@ -134,8 +133,7 @@ class Simulator:
     ) -> SimulatorHistory:
         """Wheels roll without slip, stand where the springs carry the weight, steer ahead."""
         vehicle, none = params.vehicle, jnp.zeros(4)
-        load = vehicle.mass * GRAVITY / 4
-        travel = vehicle.free_travel + (load - vehicle.wheel_weight) / vehicle.spring
+        load, travel = vehicle.mass * GRAVITY / 4, vehicle.travel_at_rest
         position = Vector.of(state.position)
         axes = Axes.from_quaternion(geometry.rotation_from_rpy(state.rpy).wxyz)
         return SimulatorHistory(

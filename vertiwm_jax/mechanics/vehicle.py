@@ -1,10 +1,19 @@
 """What a four-wheeled vehicle is: masses, suspension, drivetrain, controller, limits."""
 
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import cast
 
 import jax
 import numpy as np
 from flax import struct
+
+from vertiwm_jax import config as configuration
+
+GRAVITY = 9.81
+HMMWV = "hmmwv"
+"""The name of the vehicle that drives unless another is chosen."""
 
 
 @struct.dataclass
@@ -67,81 +76,147 @@ class Vehicle:
         """`[]` m between left and right wheels."""
         return self.wheel_position[0, 1] - self.wheel_position[1, 1]
 
-
-def _vehicle(**values: object) -> Vehicle:
-    """NumPy float32 leaves: importing must not start a device."""
-    arrays = {name: np.asarray(value, np.float32) for name, value in values.items()}
-    return Vehicle(**cast(dict[str, jax.Array], arrays))
-
-
-def _corners(x: float, y: float) -> list[tuple[float, float]]:
-    return [(x, y), (x, -y), (-x, y), (-x, -y)]
+    @property
+    def travel_at_rest(self) -> jax.Array:
+        """`[4]` m, height of the wheel centres in the body where the springs carry the weight."""
+        load = self.mass * GRAVITY / 4
+        return self.free_travel + (load - self.wheel_weight) / self.spring
 
 
-def _hull(x: float, y: float, belly: float, roof: float) -> list[tuple[float, float, float]]:
+@dataclass(frozen=True)
+class VehicleConfig:
+    """The numbers of a vehicle, SI units, as a file in `configs/vehicles` holds them.
+
+    Axes and fields are those of `Vehicle`; left and right are alike, pairs are front and rear.
+    """
+
+    mass: float
+    """kg, wheels included."""
+    centre_of_mass: tuple[float, float, float]
+    """m in the body, whose origin lies between the wheel centres of the design position."""
+    inertia: tuple[float, float, float]
+    """kg m2, principal moments about the centre of mass."""
+    wheelbase: float
+    """m between the axles."""
+    track: float
+    """m between left and right wheels."""
+    wheel_radius: float
+    """m."""
+    wheel_width: float
+    """m."""
+    wheel_inertia: float
+    """kg m2 about the axle."""
+    wheel_weight: float
+    """N, what pulls an airborne wheel down."""
+    spring: tuple[float, float]
+    """N/m at the wheel."""
+    damper: tuple[float, float]
+    """N s/m at the wheel."""
+    free_travel: tuple[float, float]
+    """m, wheel height in the body at which the spring is relaxed."""
+    steering_limit: float
+    """rad at the front wheels."""
+    steering_rate: float
+    """rad/s at the front wheels."""
+    speed_gain: float
+    """s/m, pedal per speed error; full pedal is 1."""
+    wheel_torque: float
+    """N m a wheel at full throttle."""
+    wheel_power: float
+    """W a wheel at most."""
+    wheel_speed_limit: float
+    """rad/s, mean wheel speed beyond which the engine gives nothing."""
+    brake_torque: float
+    """N m a wheel at full braking."""
+    tyre_friction: float
+    """The tyre's own friction coefficient; contact takes the smaller one."""
+    hull: tuple[float, float, float, float]
+    """The chassis as a box, m: half its length, half its width, height of underside and roof."""
+    length: float
+    """m, of the rectangle that collides with obstacles."""
+    width: float
+    """m, of that rectangle."""
+    scale: float = 1.0
+    """m at full size that 1 m of the vehicle is: about 10 for a 1/10-scale rover, so that it is as
+    large as an HMMWV there."""
+
+    def __post_init__(self) -> None:
+        signed = ("centre_of_mass", "free_travel", "hull")
+        for name, value in vars(self).items():
+            numbers = np.atleast_1d(value)
+            if not np.isfinite(numbers).all():
+                raise ValueError(f"{name}: expected finite numbers, found {value}")
+            if name not in signed and not (numbers > 0).all():
+                raise ValueError(f"{name}: expected > 0, found {value}")
+        x, y, belly, roof = self.hull
+        if not (x > 0 and y > 0 and belly < roof):
+            raise ValueError(
+                f"hull: expected half the length and half the width, > 0, and an underside below "
+                f"the roof, found {self.hull}"
+            )
+        first, second, third = sorted(self.inertia)
+        if third > first + second:
+            raise ValueError(
+                f"inertia: expected no moment larger than the sum of both others, "
+                f"found {self.inertia}"
+            )
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """At full size, by Froude's similarity; NumPy float32 leaves, which start no device.
+
+        Lengths are `scale` times those of the vehicle, times and speeds its root: gravity, slopes,
+        friction and density stay as they are, so the motion is the same but for its scale.
+        """
+        metre, second = self.scale, self.scale**0.5
+        kilogram = metre**3
+        newton = kilogram * metre / second**2
+        x, y = self.wheelbase / 2, self.track / 2
+        values = {
+            "mass": self.mass * kilogram,
+            "centre_of_mass": np.multiply(self.centre_of_mass, metre),
+            "inertia": np.multiply(self.inertia, kilogram * metre**2),
+            "wheel_position": np.multiply([(x, y), (x, -y), (-x, y), (-x, -y)], metre),
+            "wheel_radius": self.wheel_radius * metre,
+            "wheel_width": self.wheel_width * metre,
+            "wheel_inertia": self.wheel_inertia * kilogram * metre**2,
+            "wheel_weight": self.wheel_weight * newton,
+            "spring": np.repeat(self.spring, 2) * newton / metre,
+            "damper": np.repeat(self.damper, 2) * newton * second / metre,
+            "free_travel": np.repeat(self.free_travel, 2) * metre,
+            "steering_limit": self.steering_limit,
+            "steering_rate": self.steering_rate / second,
+            "speed_gain": self.speed_gain * second / metre,
+            "wheel_torque": self.wheel_torque * newton * metre,
+            "wheel_power": self.wheel_power * newton * metre / second,
+            "wheel_speed_limit": self.wheel_speed_limit / second,
+            "brake_torque": self.brake_torque * newton * metre,
+            "tyre_friction": self.tyre_friction,
+            "hull": np.multiply(_box(*self.hull), metre),
+            "length": self.length * metre,
+            "width": self.width * metre,
+        }
+        arrays = {name: np.asarray(value, np.float32) for name, value in values.items()}
+        return Vehicle(**cast(dict[str, jax.Array], arrays))
+
+
+def load(name: str) -> VehicleConfig:
+    """The vehicle of that name among those that come with the package, or in a YAML file.
+
+    name: a file's ends in .yaml or .yml. Raises `ConfigError`, which names file and field.
+    """
+    of_file = name.endswith((".yaml", ".yml"))
+    path = Path(name) if of_file else configuration.default_config(f"vehicles/{name}")
+    return configuration.load(VehicleConfig, path)
+
+
+@cache
+def hmmwv() -> Vehicle:
+    """Chrono's HMMWV, which the model that comes with the package knows."""
+    return load(HMMWV).vehicle
+
+
+def _box(x: float, y: float, belly: float, roof: float) -> list[tuple[float, float, float]]:
+    """Points of the chassis: nine below, four above."""
     underside = [(i * x, j * y, belly) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     return underside + [(i * x, j * y, roof) for i in (-1, 1) for j in (-1, 1)]
-
-
-def hmmwv() -> Vehicle:
-    """Chrono 9.0.1's HMMWV_Reduced with rigid tyres, as Verti-Bench drives it.
-
-    Masses, geometry and controller are Chrono's. Spring and damper rates at the wheel, torque
-    and power were identified from Chrono drives (wheel travel against wheel force; spin-up of
-    airborne wheels): the rates of the struts themselves act through linkages.
-    """
-    return _vehicle(
-        mass=2493.6,
-        centre_of_mass=(0.0518, 0.0, 0.1838),
-        inertia=(1444.9, 4122.4, 5025.8),
-        wheel_position=_corners(1.651, 0.910),
-        wheel_radius=0.467,
-        wheel_width=0.254,
-        wheel_inertia=11.0,
-        wheel_weight=553.0,
-        spring=(147e3, 147e3, 265e3, 265e3),
-        damper=(22.4e3, 22.4e3, 28.5e3, 28.5e3),
-        free_travel=(0.0249, 0.0249, -0.0186, -0.0186),
-        steering_limit=0.3725,
-        steering_rate=3.725,
-        speed_gain=1.0,
-        wheel_torque=6400.0,
-        wheel_power=45e3,
-        wheel_speed_limit=100.0,
-        brake_torque=4000.0,
-        tyre_friction=0.9,
-        hull=_hull(1.0, 0.5, 0.0, 1.2),
-        length=4.6,
-        width=2.1,
-    )
-
-
-def rover() -> Vehicle:
-    """A 1/10-scale crawler of the Verti-4-Wheeler's kind (Datar et al. 2024): 0.31 m wheelbase.
-
-    Nominal figures for a 3.5 kg rover with stiff tyres; measure your own before relying on them.
-    """
-    return _vehicle(
-        mass=3.5,
-        centre_of_mass=(0.0, 0.0, 0.02),
-        inertia=(0.02, 0.045, 0.055),
-        wheel_position=_corners(0.156, 0.10),
-        wheel_radius=0.055,
-        wheel_width=0.045,
-        wheel_inertia=4e-4,
-        wheel_weight=1.5,
-        spring=(570.0, 570.0, 570.0, 570.0),
-        damper=(20.0, 20.0, 20.0, 20.0),
-        free_travel=(-0.0125, -0.0125, -0.0125, -0.0125),
-        steering_limit=0.5,
-        steering_rate=6.0,
-        speed_gain=4.0,
-        wheel_torque=0.9,
-        wheel_power=12.0,
-        wheel_speed_limit=80.0,
-        brake_torque=0.9,
-        tyre_friction=0.9,
-        hull=_hull(0.12, 0.05, 0.0, 0.12),
-        length=0.43,
-        width=0.25,
-    )

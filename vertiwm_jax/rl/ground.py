@@ -12,7 +12,7 @@ import numpy as np
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.tasks import Tasks, circle_tasks, random_tasks
 from vertiwm_jax.terrain import files, vertibench, worlds
-from vertiwm_jax.terrain.map import TerrainMap, stack
+from vertiwm_jax.terrain.map import TerrainMap, enlarged, stack
 from vertiwm_jax.terrain.worlds import MEDIAN_SLOPE_DEG, WorldConfig
 
 Suite = Literal["easy", "hard", "obstacles"]
@@ -53,16 +53,17 @@ class GroundConfig:
 
 
 def grounds(
-    config: GroundConfig, path: Path | None, key: jax.Array
+    config: GroundConfig, path: Path | None, key: jax.Array, scale: float = 1.0
 ) -> tuple[TerrainMap, TerrainMap]:
     """The worlds to train on and those held out, from maps at `path` or else procedural.
 
-    path: see `load`. Too few maps to hold any out raise `ValueError`.
+    path, scale: see `load`. Too few maps to hold any out raise `ValueError`.
     """
     if path is None:
         keys = jax.random.split(jax.random.split(key)[0], config.train_worlds)
-        return worlds.generate(keys, config.training), suite_worlds(config, key)
-    terrain = load(config, path)
+        training = worlds.generate(keys, config.training, scale)
+        return training, suite_worlds(config, key, scale)
+    terrain = load(config, path, scale)
     if terrain.worlds < config.held_out_every:
         raise ValueError(
             f"{path}: held_out_every: expected at most the {terrain.worlds} worlds found, "
@@ -73,22 +74,26 @@ def grounds(
     return _subset(terrain, ~held_out), _subset(terrain, held_out)
 
 
-def suite_worlds(config: GroundConfig, key: jax.Array) -> TerrainMap:
+def suite_worlds(config: GroundConfig, key: jax.Array, scale: float = 1.0) -> TerrainMap:
     """Worlds of the configured suites that `grounds` holds out, by the same key.
 
-    Those of a suite do not depend on which others are configured.
+    Those of a suite do not depend on which others are configured. scale: as `worlds.generate`.
     """
     drawn, test_key = [], jax.random.split(key)[1]
     for number, (name, worlds_of) in enumerate(SUITES.items()):
         if name in config.suites:
             keys = jax.random.split(jax.random.fold_in(test_key, number), config.suite_worlds)
-            drawn.append(worlds.generate(keys, worlds_of))
+            drawn.append(worlds.generate(keys, worlds_of, scale))
     return stack(drawn)
 
 
-def load(config: GroundConfig, path: Path) -> TerrainMap:
-    """The maps of a Verti-Bench checkout or of a folder of `.npz` maps; else `MapError`."""
+def load(config: GroundConfig, path: Path, scale: float = 1.0) -> TerrainMap:
+    """The maps of a Verti-Bench checkout or of a folder of `.npz` maps; else `MapError`.
+
+    scale: of a small vehicle that is brought to full size, with the ground that it drives on.
+    """
     terrain = vertibench.load(path) if (path / "envs").is_dir() else files.load(path)
+    terrain = enlarged(terrain, scale, str(path))
     return terrain if config.obstacles else replace(terrain, obstacles=terrain.obstacles[:, :0])
 
 

@@ -1,6 +1,6 @@
 """Off-road navigation as what is learned: the settings and environments of every algorithm."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -8,12 +8,14 @@ import jax
 
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import tasks
+from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv, NavigationParams
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.env.variation import VariationConfig
+from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
 from vertiwm_jax.rl import ground
 from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.terrain.map import TerrainMap
@@ -26,12 +28,15 @@ class TaskConfig:
 
     seed: int = 0
     """Decides everything that is random."""
+    vehicle: str = HMMWV
+    """What the built-in simulator drives: the name of a vehicle that comes along, or a YAML file of
+    one; other models drive what they were fitted to."""
     worlds: Path | None = None
     """A Verti-Bench checkout or a folder of .npz maps; procedural worlds by default."""
     ground: GroundConfig = GroundConfig()
     """What worlds and tasks."""
     navigation: NavigationConfig = NavigationConfig()
-    """What the task is."""
+    """What the task is; a vehicle other than the HMMWV brings chassis and steering of its own."""
     variation: VariationConfig = VariationConfig()
     """How episodes differ from what map and model say, while learning."""
     model: ModelName = "builtin"
@@ -40,6 +45,23 @@ class TaskConfig:
     """Folder of a fitted model, instead of the one that comes with the package."""
     simulator: Simulator = Simulator()
     """The built-in simulator."""
+
+    def __post_init__(self):
+        vehicle.load(self.vehicle)  # That it cannot be read is to be said now.
+
+    @property
+    def driven(self) -> VehicleConfig:
+        """The vehicle; `ConfigError` if there is no such."""
+        return vehicle.load(self.vehicle)
+
+    @property
+    def asked(self) -> NavigationConfig:
+        """`navigation` for the vehicle."""
+        if self.vehicle == HMMWV:
+            return self.navigation
+        chosen = self.driven.vehicle
+        limit = float(chosen.steering_limit)
+        return replace(self.navigation, chassis=Chassis.of(chosen), steering_limit=limit)
 
     def key(self, purpose: Literal["worlds", "tasks", "training", "testing"]) -> jax.Array:
         """The random key of one purpose."""
@@ -61,8 +83,8 @@ def training_environment(config: TaskConfig) -> tuple[Task, TerrainMap]:
     Maps that cannot be used, and tasks that cannot be driven on them, raise `ValueError`; weights
     that cannot be read, `CheckpointError`.
     """
-    navigation = config.navigation
-    terrain, held_out = ground.grounds(config.ground, config.worlds, config.key("worlds"))
+    navigation, scale = config.asked, config.driven.scale
+    terrain, held_out = ground.grounds(config.ground, config.worlds, config.key("worlds"), scale)
     # Now, and not when the training is over.
     tests = ground.test_tasks(config.ground, held_out)
     tasks.validate(tests, held_out, navigation.goal_radius, navigation.map_margin)
@@ -72,10 +94,10 @@ def training_environment(config: TaskConfig) -> tuple[Task, TerrainMap]:
 
 def held_out(config: TaskConfig) -> TerrainMap:
     """The worlds that `training_environment` holds out."""
-    key = config.key("worlds")
+    key, scale = config.key("worlds"), config.driven.scale
     if config.worlds is None:
-        return ground.suite_worlds(config.ground, key)
-    return ground.grounds(config.ground, config.worlds, key)[1]
+        return ground.suite_worlds(config.ground, key, scale)
+    return ground.grounds(config.ground, config.worlds, key, scale)[1]
 
 
 def test_environment(config: TaskConfig, terrain: TerrainMap, model: ModelName = "builtin") -> Task:
@@ -92,14 +114,14 @@ def environment(
 ) -> Task:
     """Tasks inside one of the models."""
     moves, params = dynamics(config, model)
-    env = NavigationEnv(moves, config.navigation, variation)
+    env = NavigationEnv(moves, config.asked, variation)
     return Task(env, env.make_params(params, terrain, pool))
 
 
 def dynamics(config: TaskConfig, model: ModelName) -> tuple[Dynamics, Params]:
     """One of the models, and its parameters."""
     if model == "builtin":
-        chosen = config.simulator, chrono_like(hmmwv())
+        chosen = config.simulator, chrono_like(config.driven.vehicle)
     else:
         chosen = choose(model, config.weights)
     return sighted(model, *chosen, config.weights) if config.navigation.embeddings else chosen

@@ -6,9 +6,8 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax import geometry
-from vertiwm_jax.env import tasks
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.mechanics.simulator import (
     GroundForces,
     Simulator,
@@ -16,7 +15,7 @@ from vertiwm_jax.mechanics.simulator import (
     SimulatorParams,
     chrono_like,
 )
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
 from vertiwm_jax.simulators.protocol import SETTLE_SECONDS, Observation, under_wheels
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
@@ -34,13 +33,13 @@ class _Moving:
 
 
 class BuiltIn:
-    """An HMMWV on the selected world of a map, compiled once for all maps of one size.
+    """A vehicle on the selected world of a map, compiled once for all maps of one size.
 
-    Obstacles are no hindrance.
+    Obstacles are no hindrance. vehicle: the HMMWV by default.
     """
 
-    def __init__(self, terrain: TerrainMap) -> None:
-        self._terrain, self._params = terrain, chrono_like(hmmwv())
+    def __init__(self, terrain: TerrainMap, vehicle: Vehicle | None = None) -> None:
+        self._terrain, self._params = terrain, chrono_like(vehicle or hmmwv())
 
     def start(self, x: float, y: float, yaw: float) -> Observation:
         """As `Simulator.start`."""
@@ -59,7 +58,10 @@ class BuiltIn:
 
 @jax.jit
 def _place(params: SimulatorParams, terrain: TerrainMap, pose: jax.Array) -> _Moving:
-    state = tasks.place(terrain, Chassis(), pose[:2], pose[2])
+    vehicle, still = params.vehicle, jnp.zeros(3)
+    sizes = vehicle.wheelbase, vehicle.track, vehicle.wheel_radius
+    position, rpy = rest_on_ground(terrain, pose[:2], pose[2], *sizes)
+    state = VehicleState(position, rpy, still, still)
     history, none = DYNAMICS.init(params, terrain, state), jnp.zeros((4, 3))
     return _Moving(state, history, GroundForces(none, none[0]))
 

@@ -11,7 +11,6 @@ from vertiwm_jax.env import observation
 from vertiwm_jax.env.driver import Policy
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.termination import edge_distance
-from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query
@@ -66,9 +65,9 @@ def start(rng: np.random.Generator, terrain: TerrainMap, seconds: float) -> tupl
     )
 
 
-def sinusoids(rng: np.random.Generator, steps: int) -> Pilot:
+def sinusoids(rng: np.random.Generator, steps: int, full_lock: float) -> Pilot:
     """The paper's commands: speed at 0.1 to 2.5 Hz between bounds that are drawn from 1 to 2 and 3
-    to 4 m/s, steering at 0.1 to 0.5 Hz with an amplitude of 0.2 to 1 of full lock."""
+    to 4 m/s, steering at 0.1 to 0.5 Hz with an amplitude of 0.2 to 1 of `full_lock`, rad."""
     time = STEP_SECONDS * np.arange(steps)
 
     def wave(fastest: float) -> np.ndarray:
@@ -77,7 +76,7 @@ def sinusoids(rng: np.random.Generator, steps: int) -> Pilot:
 
     low, high = rng.uniform(1, 2), rng.uniform(3, 4)
     speed = (low + high) / 2 + (high - low) / 2 * wave(2.5)
-    steering = float(hmmwv().steering_limit) * rng.uniform(0.2, 1.0) * wave(0.5)
+    steering = full_lock * rng.uniform(0.2, 1.0) * wave(0.5)
     commands = iter(np.stack([speed, steering], axis=1))
     return lambda state: next(commands)
 

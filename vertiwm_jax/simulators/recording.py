@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from vertiwm_jax.learning import schema
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.simulators.pilots import MARGIN, Pilot, within
 from vertiwm_jax.simulators.protocol import Observation, Simulator
 from vertiwm_jax.state import STEP_SECONDS
@@ -62,20 +62,21 @@ def record(
     return Drive(observations, np.reshape(control, (-1, 2)), ending or "time")
 
 
-def archive(drives: Sequence[Drive], steps: int, meta: dict[str, Any]) -> bytes:
-    """A file of the schema with K drives, each filled up to `steps` with its last values.
+def archive(drives: Sequence[Drive], steps: int, meta: dict[str, Any], vehicle: Vehicle) -> bytes:
+    """A file of the schema with K drives of a vehicle, each filled up to `steps` with its last
+    values.
 
-    meta: holds "map", the file name of the terrain map; the vehicle is added.
+    meta: holds "map", the file name of the terrain map; the wheels are added.
     """
     columns = [_columns(drive, steps) for drive in drives]
-    vehicle = {"wheels_in_body_xy": np.asarray(hmmwv().wheel_position).tolist()}
+    wheels = {"wheels_in_body_xy": np.asarray(vehicle.wheel_position).tolist()}
     stream = io.BytesIO()
     np.savez_compressed(
         stream,
         allow_pickle=False,
         length=np.array([len(drive.control) for drive in drives], np.int32),
         ending=np.array([drive.ending for drive in drives]),
-        meta=np.array(json.dumps({**meta, "dt": STEP_SECONDS, "vehicle": vehicle})),
+        meta=np.array(json.dumps({**meta, "dt": STEP_SECONDS, "vehicle": wheels})),
         **{name: np.stack([column[name] for column in columns]) for name in columns[0]},
     )
     return stream.getvalue()

@@ -170,6 +170,25 @@ def stack(maps: Sequence[TerrainMap], names: Sequence[str] | None = None) -> Ter
     )
 
 
+def enlarged(terrain: TerrainMap, scale: float, name: str = "map") -> TerrainMap:
+    """The ground that a vehicle `scale` times as large meets as one of the size given meets it.
+
+    Lengths are `scale` times as large, and soils as `soil.enlarged` has them; heights must still be
+    within `elevation_range`, which models know. Raises `MapError`, which calls the map `name`.
+    """
+    if scale == 1:
+        return terrain
+    larger = replace(
+        terrain,
+        elevation=scale * terrain.elevation,
+        obstacles=scale * terrain.obstacles,
+        origin=scale * terrain.origin,
+        resolution=scale * terrain.resolution,
+        soils=soil.enlarged(terrain.soils, scale),
+    )
+    return validate(larger, f"{name}, {scale:g} times as large")
+
+
 def validate(terrain: TerrainMap, name: str = "map") -> TerrainMap:
     """The same map if it can be used; `MapError` names `name`, the field and the place.
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from vertiwm_jax.terrain.classes import FIRST_DEFORMABLE, FRICTION_LIMITS, STANDARD
 from vertiwm_jax.terrain.map import ELEVATION_RANGE, TerrainMap
+from vertiwm_jax.terrain.soil import enlarged
 
 VERTICES = 129
 RESOLUTION = 1.0
@@ -108,8 +109,12 @@ def labels(config: WorldConfig, count: int) -> list[tuple[Difficulty | float, Ki
     return [(difficulty, kind) for kind, difficulty in islice(cycle(pairs), count)]
 
 
-def generate(keys: jax.Array, config: WorldConfig) -> TerrainMap:
-    """Draws one world for each of the typed keys `[W]`, on the device; deterministic."""
+def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> TerrainMap:
+    """Draws one world for each of the typed keys `[W]`, on the device; deterministic.
+
+    scale: of a small vehicle that is brought to full size, where soils are `soil.enlarged`: the
+        worlds are as large as ever there, and so small to the vehicle itself.
+    """
     drawn = labels(config, len(keys))
     slope = [d if isinstance(d, float | int) else MEDIAN_SLOPE_DEG[d] for d, _ in drawn]
     kind = [_KINDS.index(k) for _, k in drawn]
@@ -133,7 +138,7 @@ def generate(keys: jax.Array, config: WorldConfig) -> TerrainMap:
         elevation_range=jnp.array(ELEVATION_RANGE, jnp.float32),
         class_rgb=jnp.asarray(STANDARD.rgb),
         deformable=jnp.asarray(STANDARD.deformable),
-        soils=STANDARD.stacked_soils(),
+        soils=enlarged(STANDARD.stacked_soils(), scale),
         world=jnp.int32(0),
         class_names=STANDARD.names,
     )

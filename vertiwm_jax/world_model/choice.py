@@ -7,7 +7,7 @@ from typing import Literal
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
 from vertiwm_jax.world_model import model
 from vertiwm_jax.world_model.model import ModelConfig
 from vertiwm_jax.world_model.nesam import SoilSource
@@ -18,16 +18,20 @@ ModelName = Literal["builtin", "transformer", "nesam", "vertiwm"]
 
 
 def choose(
-    name: ModelName, weights: Path | None = None, soil: SoilSource | None = None
+    name: ModelName,
+    weights: Path | None = None,
+    soil: SoilSource | None = None,
+    vehicle: Vehicle | None = None,
 ) -> tuple[Dynamics, Params]:
-    """The model and its parameters, for Chrono's HMMWV.
+    """The model and its parameters.
 
     weights: folder of a fitted model; the one that comes with the package by default. soil: where
-    NeSAM has soils from, if not from where it had them when it was fitted. Raises what `model.load`
-    raises, and `CheckpointError` when it holds other parts alone.
+    NeSAM has soils from, if not from where it had them when it was fitted. vehicle: of the
+    simulator, the HMMWV by default; learned models move the one that they were fitted to. Raises
+    what `model.load` raises, and `CheckpointError` when it holds other parts alone.
     """
     if name == "builtin":
-        return Simulator(), chrono_like(hmmwv())
+        return Simulator(), chrono_like(vehicle or hmmwv())
     folder = weights or model.PRETRAINED
     found = fitted(folder, soil)
     if name not in found:

@@ -1,0 +1,46 @@
+"""What is driven, where: another vehicle brings its shape, and its ground."""
+
+import jax
+import numpy as np
+import pytest
+
+from vertiwm_jax import config
+from vertiwm_jax.config import ConfigError
+from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.mechanics import vehicle
+from vertiwm_jax.rl import task
+from vertiwm_jax.rl.ground import GroundConfig
+from vertiwm_jax.rl.task import TaskConfig
+from vertiwm_jax.terrain.classes import STANDARD
+
+GROUND = GroundConfig(suites=("easy",), suite_worlds=1, pairs=2)
+
+
+def test_the_hmmwv_is_as_navigation_says():
+    asked = NavigationConfig(steering_limit=0.3)
+    assert TaskConfig(navigation=asked).asked == asked
+
+
+def test_another_vehicle_brings_its_chassis_and_its_steering():
+    rover, found = vehicle.load("rover"), TaskConfig(vehicle="rover").asked
+    assert found.steering_limit == rover.steering_limit
+    np.testing.assert_allclose(found.chassis.wheelbase, rover.scale * rover.wheelbase, rtol=1e-6)
+    np.testing.assert_allclose(found.chassis.width, rover.scale * rover.width, rtol=1e-6)
+
+
+def test_a_rover_is_tested_on_soil_of_its_scale():
+    known, rover = (TaskConfig(vehicle=name, ground=GROUND) for name in ("hmmwv", "rover"))
+    ground, small = task.held_out(known), task.held_out(rover)
+    np.testing.assert_array_equal(small.elevation, ground.elevation)
+    sand = STANDARD.names.index("sand")
+    np.testing.assert_allclose(small.soils.cohesion[sand], 10 * ground.soils.cohesion[sand])
+    test = task.test_environment(rover, small)
+    assert np.isfinite(test.params.starts.vehicle.vector).all()
+    found = test.params.dynamics.vehicle
+    jax.tree.map(np.testing.assert_array_equal, found, vehicle.load("rover").vehicle)
+
+
+def test_a_vehicle_that_is_none_is_named(tmp_path):
+    (tmp_path / "task.yaml").write_text("vehicle: rovr")
+    with pytest.raises(ConfigError, match=r"task\.yaml: .*did you mean 'rover'"):
+        config.load(TaskConfig, tmp_path / "task.yaml")
