@@ -22,7 +22,7 @@ from vertiwm_jax.learning.dataset import SPLITS
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.runs import Progress, RunError
 from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain.map import MapError, TerrainMap
+from vertiwm_jax.terrain.map import MapError, TerrainMap, enlarged
 
 Format = Literal["csv", "parquet", "rosbag", "tartandrive"]
 READERS: dict[Format, Callable[[Path, ImportSettings], list[Log]]] = {
@@ -129,13 +129,14 @@ def _terrain(command: ImportDrives, settings: ImportSettings) -> tuple[TerrainMa
     if command.map is not None:
         if command.map.is_dir():
             raise DataError(f"{command.map}: expected the .npz map of one world, found a folder")
-        return files.load(command.map), []
+        return enlarged(files.load(command.map), settings.vehicle.scale, str(command.map)), []
     if settings.rosbag is None or settings.rosbag.grid_map is None:
         raise DataError(
             f"{command.settings}: expected ground: give `--map MAP.npz`, which terrain.files.save "
             "writes (docs/own-map.md), or name a bag's GridMap topic in rosbag.grid_map"
         )
     terrain, unknown = grid_map.terrain(command.sources, settings.rosbag.grid_map, settings.frames)
+    terrain = enlarged(terrain, settings.vehicle.scale, settings.rosbag.grid_map.topic)
     return terrain, [f"{unknown:.0%} of the map had no height, and took that of the nearest cell"]
 
 
@@ -144,7 +145,7 @@ def _import(
 ) -> Imported:
     """The drives of all logs of a source that are on the map."""
     drives, left_out = [], Counter[str]()
-    point = np.asarray(settings.vehicle.logged_point)
+    point = settings.vehicle.scale * np.asarray(settings.vehicle.logged_point)
     for log in logs:
         found = resampling.resample(log, settings.resampling, point)
         left_out += found.left_out

@@ -1,4 +1,4 @@
-"""A drive as it was logged: checked, in SI units and in the axes of this project."""
+"""A drive as it was logged: checked, in SI units, at full size and in the axes of this project."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,6 +63,8 @@ def build(
     _check_increasing(name, "time", time)
     _check_increasing(name, "time of commands", command_time)
     units, frames = settings.units, settings.frames
+    metre = settings.vehicle.scale
+    second = metre**0.5  # Froude's similarity: gravity is the same at any size.
     # Half a turn about x takes z_down to z_up, in the world and in the body.
     axes = np.array([1, 1, 1] if frames.axes == "z_up" else [1, -1, -1])
     if attitude.shape[1] == 3:
@@ -72,21 +74,21 @@ def build(
         _check_length(name, attitude)
         rotation = Rotation.from_quat(attitude * [*axes, 1])
     if velocity is not None:
-        velocity = axes * units.velocity * velocity
+        velocity = axes * units.velocity * metre / second * velocity
         velocity = velocity if frames.velocity == "body" else rotation.inv().apply(velocity)
     if angular_velocity is not None:
-        omega = axes * units.angle * angular_velocity
+        omega = axes * units.angle / second * angular_velocity
         angular_velocity = (
             omega if frames.angular_velocity == "body" else rotation.inv().apply(omega)
         )
     return Log(
-        time=units.time * time,
-        position=axes * units.position * position - np.asarray(frames.origin),
+        time=second * units.time * time,
+        position=metre * (axes * units.position * position - np.asarray(frames.origin)),
         rotation=rotation,
         velocity=velocity,
         angular_velocity=angular_velocity,
-        command_time=units.time * command_time,
-        command=command * [units.speed, units.steering],
+        command_time=second * units.time * command_time,
+        command=command * [metre / second * units.speed, units.steering],
     )
 
 

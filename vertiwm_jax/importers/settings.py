@@ -21,16 +21,19 @@ class VehicleSettings:
     logged_point: Triple = (0.0, 0.0, 0.0)
     """The point whose position is logged, in the body frame of this project (x forward, y left,
     z up, from the point between the four wheel centres), m."""
+    scale: float = 1.0
+    """m at full size that 1 m of the vehicle is, as in its file; drives and map become as large,
+    and times and speeds its root times as large, before `resampling`."""
 
     def __post_init__(self):
-        for name in ("wheelbase", "track"):
+        for name in ("wheelbase", "track", "scale"):
             if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected metres, > 0, found {getattr(self, name)}")
+                raise ValueError(f"{name}: expected > 0, found {getattr(self, name)}")
 
     @property
     def wheels_in_body_xy(self) -> list[list[float]]:
-        """FL, FR, RL, RR, m."""
-        x, y = self.wheelbase / 2, self.track / 2
+        """FL, FR, RL, RR, m at full size."""
+        x, y = self.scale * self.wheelbase / 2, self.scale * self.track / 2
         return [[x, y], [x, -y], [-x, y], [-x, -y]]
 
 
