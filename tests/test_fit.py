@@ -14,7 +14,6 @@ from vertiwm_jax import evaluate, fit, runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.world_model import model
 from vertiwm_jax.world_model.choice import choose
@@ -155,17 +154,6 @@ def test_a_fit_goes_on_from_a_model_with_more_drives(run, fitted, folder, tmp_pa
     message = refusal(fit.main, *other, "--start", run / "model", "--runs", tmp_path / "runs")
     assert "coefficients='scalar'" in message and "coefficients='grouped'" in message
     assert not (tmp_path / "runs").exists()
-
-
-def test_the_physics_of_another_vehicle_is_what_is_corrected(run, fitted):
-    rover = vehicle.load("rover").vehicle
-    for begun in ([], ["--start", str(run / "model")]):
-        other = fitted("--vehicle", "rover", *begun)
-        found = model.load(other / "model")[1].nesam.simulator.vehicle
-        chex.assert_trees_all_equal(found, rover)
-        places = (run / "nesam_rollouts", other / "nesam_rollouts")
-        first, second = ((place / "inputs.txt").read_text() for place in places)
-        assert first != second
 
 
 def test_one_specialist_alone_is_fitted_and_compared(fitted, folder, tmp_path, capsys):

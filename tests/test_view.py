@@ -27,7 +27,7 @@ sac:
 @pytest.fixture
 def uniform(monkeypatch):
     """Models by name are one that compiles in no time."""
-    monkeypatch.setattr(view, "choose", lambda name, weights: (ConstantVelocity(), None))
+    monkeypatch.setattr(view, "choose", lambda name, weights, **_: (ConstantVelocity(), None))
 
 
 def test_a_recorded_drive(uniform, tmp_path, capsys, monkeypatch):
@@ -50,6 +50,14 @@ def test_a_recorded_drive(uniform, tmp_path, capsys, monkeypatch):
         assert image.n_frames == recordings.STEPS / 2 + 1
     names = {"a.npz", "maps", "a-drive-4.rrd", "other.rrd", "a.gif"}
     assert {path.name for path in tmp_path.iterdir()} == names
+
+
+def test_another_vehicle_is_shown_as_large_as_it_is(uniform, tmp_path):
+    path = recordings.write(tmp_path)
+    for name, wheelbase in ((None, 3.302), ("rover", 3.12)):
+        scene = view._recorded(view.View(path, vehicle=name))
+        np.testing.assert_allclose(scene.vehicle.wheelbase, wheelbase, rtol=1e-5)
+    assert "did you mean 'rover'" in refusal(view.main, path, "--vehicle", "rovr")
 
 
 @pytest.mark.slow

@@ -13,6 +13,8 @@ from vertiwm_jax import policy_training
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.evaluate import training
+from vertiwm_jax.mechanics import vehicle
+from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.ground import Suite
 from vertiwm_jax.runs import RunError
@@ -31,6 +33,8 @@ class View:
     """What a policy drives in, or whose predictions are shown beside a recorded drive."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
+    vehicle: str | None = None
+    """Name or YAML file of the vehicle; by default that of the policy's training, or the HMMWV."""
     suite: Suite | None = None
     """Kind of procedural worlds to drive a policy on; all that were held out by default."""
     task: int | None = None
@@ -120,6 +124,8 @@ def _driven(command: View) -> Scene:
         config = replace(config, ground=replace(config.ground, suites=(command.suite,)))
     if command.weights:
         config = replace(config, weights=command.weights)
+    if command.vehicle is not None:
+        config = replace(config, vehicle=command.vehicle)
     terrain = task.held_out(config)
     policies = policy_training.learned(config, terrain, run)
     pool = ground.test_tasks(config.ground, terrain)
@@ -130,7 +136,8 @@ def _driven(command: View) -> Scene:
     test = task.environment(config, command.model, terrain, alone)
     name, policy = list(policies.items())[seed]
     title = f"{name} in {command.model}"
-    return driven.drive(test.env, test.params, policy, config.key("testing"), title)
+    scene = driven.drive(test.env, test.params, policy, config.key("testing"), title)
+    return replace(scene, vehicle=config.driven.vehicle)
 
 
 def _recorded(command: View) -> Scene:
@@ -141,8 +148,9 @@ def _recorded(command: View) -> Scene:
             raise ConfigError(
                 f"{file}: {name}: is of a policy, expected the folder of a run, found none"
             )
-    model = choose(command.model, command.weights)
-    return recorded.load(file, number, command.model, *model)
+    shown = vehicle.load(command.vehicle or HMMWV).vehicle
+    model = choose(command.model, command.weights, vehicle=shown)
+    return replace(recorded.load(file, number, command.model, *model), vehicle=shown)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,53 @@
+"""Whose physics is fitted; what is fitted, and in which order, is tested with the command."""
+
+from pathlib import Path
+
+import chex
+import jax
+import pytest
+from learning import recordings
+
+from vertiwm_jax.learning import pipeline, stages
+from vertiwm_jax.learning.pipeline import PipelineConfig
+from vertiwm_jax.mechanics import vehicle
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.runs import Run
+from vertiwm_jax.world_model import model
+from vertiwm_jax.world_model.model import ModelConfig
+
+NESAM = ModelConfig(parts=("nesam",))
+
+
+def test_a_fit_that_goes_on_keeps_its_vehicle_unless_told(tmp_path, monkeypatch):
+    told = []
+
+    def nothing_learned(run, name, inputs, params, *_):
+        told.append(str(inputs))
+        return params
+
+    monkeypatch.setattr(stages, "fit", nothing_learned)
+    recordings.write(tmp_path)
+    start, run = model.load(model.PRETRAINED)[1], Run(tmp_path, None)
+    for name, driven in ((None, hmmwv()), ("rover", vehicle.load("rover").vehicle)):
+        config = PipelineConfig(model=NESAM, vehicle=name)
+        fitted = pipeline.fit(config, [tmp_path], jax.random.key(0), run, start=start)
+        chex.assert_trees_all_equal(fitted.nesam.simulator.vehicle, driven)
+        chex.assert_trees_all_equal(fitted.nesam.network, start.nesam.network)
+    # A stage of one is not taken over for the other.
+    assert told[0] != told[1]
+
+
+def test_a_vehicle_that_is_none_is_named():
+    with pytest.raises(ValueError, match="did you mean 'rover'"):
+        PipelineConfig(vehicle="rovr")
+
+
+def test_stages_from_nothing_are_of_their_vehicle():
+    """By what a stage knows its inputs by, whose file may have changed."""
+
+    def begun(name):
+        config = PipelineConfig(model=NESAM, vehicle=name)
+        run = Run(Path("."), None)
+        return pipeline._Pipeline(config, (), jax.random.key(0), run, (), None)._begun
+
+    assert begun(None) == () and "mass=3.5" in begun("rover")[0]
