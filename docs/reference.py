@@ -20,6 +20,8 @@ from vertiwm_jax.collect import Collect
 from vertiwm_jax.compare import CompareConfig
 from vertiwm_jax.fit import FitConfig
 from vertiwm_jax.importers.settings import ImportSettings
+from vertiwm_jax.make_logs import MakeLogs
+from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.sac import SACTraining
 from vertiwm_jax.td3 import TD3Training
@@ -32,6 +34,8 @@ COMMANDS = {
     "compare": CompareConfig,
     "collect": Collect,
     "import_drives --settings": ImportSettings,
+    "make_logs": MakeLogs,
+    "collect --vehicle": VehicleConfig,
 }
 
 
