@@ -3,7 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax.mechanics.wheel import MAX_SINKAGE, Contact, Scalar, Wheel, forces
+from vertiwm_jax.mechanics.scm import ScmContact, soil_forces
+from vertiwm_jax.mechanics.wheel import MAX_SINKAGE, Contact, Scalar, Wheel
 from vertiwm_jax.terrain.soil import Soil
 
 _BISECTIONS = 26  # of 1.5 radii: past the last bit of float32
@@ -12,7 +13,7 @@ _BISECTIONS = 26  # of 1.5 radii: past the last bit of float32
 def equilibrium_sinkage(
     wheel: Wheel,
     soil: Soil,
-    contact: Contact,
+    contact: Contact | ScmContact,
     load: Scalar,
     velocity_x: Scalar,
     velocity_y: Scalar,
@@ -28,8 +29,8 @@ def equilibrium_sinkage(
     """
 
     def unbalanced(sinkage: jax.Array) -> jax.Array:
-        wrench = forces(wheel, soil, contact, sinkage, velocity_x, velocity_y, omega, rut, nodes)
-        return wrench.normal - load
+        motion = velocity_x, velocity_y, omega
+        return soil_forces(wheel, soil, contact, sinkage, *motion, rut, nodes).normal - load
 
     def bisect(residual, low: jax.Array) -> jax.Array:
         def halve(_, bracket: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

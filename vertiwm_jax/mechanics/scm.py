@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax.mechanics.stress import Scalar, Wheel, contact_angle, sin_cos
+from vertiwm_jax.mechanics import wheel as bekker_wong
+from vertiwm_jax.mechanics.stress import Contact, Scalar, Wheel, contact_angle, sin_cos
 from vertiwm_jax.mechanics.wheel import MAX_SINKAGE, WheelForces
 from vertiwm_jax.terrain.soil import Soil
 
@@ -41,6 +42,24 @@ class ScmContact:
     damping: Scalar = 3e4
     fresh_speed: Scalar = 1.0
     creep_speed: Scalar = 0.1
+
+
+def soil_forces(
+    wheel: Wheel,
+    soil: Soil,
+    contact: Contact | ScmContact,
+    sinkage: Scalar,
+    velocity_x: Scalar,
+    velocity_y: Scalar,
+    omega: Scalar,
+    rut: Scalar = 0.0,
+    nodes: int = 6,
+) -> WheelForces:
+    """`scm_forces` or `wheel.forces`, `[...]`, by the type of contact."""
+    motion = sinkage, velocity_x, velocity_y, omega, rut
+    if isinstance(contact, ScmContact):
+        return scm_forces(wheel, soil, contact, *motion, nodes)
+    return bekker_wong.forces(wheel, soil, contact, *motion, nodes)
 
 
 def scm_forces(

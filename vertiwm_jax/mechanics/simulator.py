@@ -23,11 +23,11 @@ from vertiwm_jax.mechanics.newton_euler import (
     turned,
     velocity_at,
 )
-from vertiwm_jax.mechanics.scm import ScmContact, scm_forces
+from vertiwm_jax.mechanics.scm import ScmContact, soil_forces
 from vertiwm_jax.mechanics.touch import Touch, touch
 from vertiwm_jax.mechanics.vector import Axes, Vector
 from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle
-from vertiwm_jax.mechanics.wheel import Contact, Wheel, WheelForces, forces, rigid_forces
+from vertiwm_jax.mechanics.wheel import Contact, Wheel, WheelForces, rigid_forces
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
@@ -326,14 +326,11 @@ def _support(
     Soil and suspension share the depth: one Newton step a sub-step towards the sinkage at which
     their forces agree. Rigid ground leaves all of it to the suspension.
     """
-    vehicle, soil = params.vehicle, _scaled(params, wheels.soil)
+    vehicle, soil = params.vehicle, stiffened(params, wheels.soil)
     wheel = Wheel(vehicle.wheel_radius, vehicle.wheel_width)
     spin = history.wheel_speed
-    contact, motion = params.contact, (history.sinkage, ahead, drift, spin, rut)
-    if isinstance(contact, ScmContact):
-        in_soil = scm_forces(wheel, soil, contact, *motion, QUADRATURE_NODES)
-    else:
-        in_soil = forces(wheel, soil, contact, *motion, QUADRATURE_NODES)
+    motion = history.sinkage, ahead, drift, spin, rut
+    in_soil = soil_forces(wheel, soil, params.contact, *motion, QUADRATURE_NODES)
     # Normal force grows about like sinkage to the power n + 1/2 (Bekker, wheel on flat ground).
     sunk = jnp.maximum(history.sinkage - rut, LEAST_SINKAGE)
     yielding = (soil.n + 0.5) * in_soil.normal / sunk
@@ -352,7 +349,8 @@ def _support(
     return ground, sinkage, load, rate
 
 
-def _scaled(params: SimulatorParams, soil: Soil) -> Soil:
+def stiffened(params: SimulatorParams, soil: Soil) -> Soil:
+    """The soil `[...]` that the wheels meet, of one of the map's."""
     return replace(
         soil,
         kc=params.stiffening * soil.kc,

@@ -43,12 +43,19 @@ class SoilPredictor(nn.Module):
         x = nn.silu(nn.Conv(64, (3, 3), strides=2)(x))
         x = jnp.mean(x, axis=(-3, -2))
         x = nn.silu(nn.Dense(64)(x))
-        shares = nn.sigmoid(nn.Dense(len(BOUNDS))(x))
-        fields = {
-            name: _between(shares[..., i], *bounds, name in _LOGARITHMIC)
-            for i, (name, bounds) in enumerate(BOUNDS.items())
-        }
-        return Soil(**fields, unit_weight=jnp.broadcast_to(unit_weight, shares.shape[:-1]))
+        return of_shares(nn.sigmoid(nn.Dense(len(BOUNDS))(x)), unit_weight)
+
+
+def of_shares(shares: jax.Array, unit_weight: jax.Array) -> Soil:
+    """`[..., 6]` where in `BOUNDS` each parameter lies to soils `[...]`: the inverse of `shares`.
+
+    unit_weight: rho g, N/m3, `[...]` or broadcast.
+    """
+    fields = {
+        name: _between(shares[..., i], *bounds, name in _LOGARITHMIC)
+        for i, (name, bounds) in enumerate(BOUNDS.items())
+    }
+    return Soil(**fields, unit_weight=jnp.broadcast_to(unit_weight, shares.shape[:-1]))
 
 
 def shares(soil: Soil) -> jax.Array:
