@@ -123,7 +123,7 @@ def test_interval_covers_the_mean_as_often_as_it_says_though_drives_differ():
     for _ in range(300):
         values = rng.exponential(size=60)[drive] * rng.uniform(0.8, 1.2, drive.size)
         for groups, hits in ((drive, covered), (np.arange(drive.size), naive)):
-            found = prediction._bootstrap(values, groups)
+            found = prediction.bootstrap(values, groups)
             hits.append(found.low < 1 < found.high)
     assert 0.89 < np.mean(covered) < 0.99
     assert np.mean(naive) < 0.8

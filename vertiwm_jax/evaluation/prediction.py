@@ -129,7 +129,7 @@ def evaluate(name: str, dynamics: Dynamics, params: Params, test: TestWindows) -
     ground = np.asarray(test.windows.ground)
     rows = {kind: ground == i for i, kind in enumerate(GROUNDS) if (ground == i).any()}
     final = {
-        measure: {kind: _bootstrap(error[row, -1], test.drive[row]) for kind, row in rows.items()}
+        measure: {kind: bootstrap(error[row, -1], test.drive[row]) for kind, row in rows.items()}
         for measure, error in errors.items()
     }
     growth = {kind: errors["position"][row].mean(axis=0).tolist() for kind, row in rows.items()}
@@ -184,7 +184,7 @@ def _published(row: PredictionErrors, measure: str) -> dict[str, float]:
     return POSITION_ERRORS.get(row.name, {}) if measure == "position" else {}
 
 
-def _bootstrap(values: np.ndarray, groups: np.ndarray, draws: int = 1000) -> Interval:
+def bootstrap(values: np.ndarray, groups: np.ndarray, draws: int = 1000) -> Interval:
     """The mean of values `[n]`, and its interval when whole groups `[n]` are drawn again."""
     names, member = np.unique(groups, return_inverse=True)
     sums, sizes = np.bincount(member, values), np.bincount(member)
