@@ -1,4 +1,4 @@
-"""`python -m vertiwm_jax.evaluate`: how well a model predicts, and how well a policy drives."""
+"""`python -m vertiwm_jax.evaluate`: how well a model predicts and adapts, and a policy drives."""
 
 import sys
 from collections.abc import Sequence
@@ -7,22 +7,32 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+import jax
 import tyro
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import devices, policy_training
+from vertiwm_jax.adaptation.soil_filter import SoilFilter
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.evaluation import navigation, outside, prediction, prediction_report, report
+from vertiwm_jax.evaluation import (
+    adaptation,
+    navigation,
+    outside,
+    prediction,
+    prediction_report,
+    report,
+)
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.fit import FitConfig
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
-from vertiwm_jax.mechanics.vehicle import HMMWV
+from vertiwm_jax.mechanics.simulator import chrono_like
+from vertiwm_jax.mechanics.vehicle import HMMWV, hmmwv
 from vertiwm_jax.policy_training import TrainConfig
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import ground, task
@@ -34,6 +44,7 @@ from vertiwm_jax.simulators import chrono
 from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.td3 import TD3Training
+from vertiwm_jax.terrain.soil import PRESETS
 from vertiwm_jax.world_model.choice import ModelName, choose, fitted
 from vertiwm_jax.world_model.nesam import SoilSource
 
@@ -79,6 +90,32 @@ class Prediction:
 
 
 @dataclass(frozen=True)
+class Adaptation:
+    """Open-loop position errors where the map has soils wrong, and how they are adapted to."""
+
+    data: Path
+    """Folder of `.npz` files of drives, with the maps they name."""
+    model: ModelName = "nesam"
+    """The model that adapts."""
+    weights: Path | None = None
+    """Folder of a fitted model, instead of the one that comes with the package."""
+    wrong: str = "snow"
+    """What the map is made to say of all soil: a name of `terrain.soil.PRESETS`."""
+    split: dataset.Split = "test"
+    """Which of the drives."""
+    every: int = 1
+    """Of how many drives one is used."""
+    filter: SoilFilter = SoilFilter()
+    """How soils are estimated."""
+
+    def __post_init__(self):
+        if self.wrong not in PRESETS:
+            raise ValueError(f"wrong: expected one of {', '.join(PRESETS)}, found {self.wrong!r}")
+        if self.every < 1:
+            raise ValueError(f"every: expected at least 1, found {self.every}")
+
+
+@dataclass(frozen=True)
 class Navigation:
     """Success, time, roll and pitch of a policy, on worlds that it was not trained on.
 
@@ -121,14 +158,19 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
     devices.use_cores()
     command = tyro.cli(
-        Prediction | Navigation,
+        Prediction | Adaptation | Navigation,
         args=argv,
         prog="python -m vertiwm_jax.evaluate",
         description=__doc__,
         config=(tyro.conf.FlagConversionOff,),
     )
     try:
-        _predict(command) if isinstance(command, Prediction) else _navigate(command)
+        if isinstance(command, Prediction):
+            _predict(command)
+        elif isinstance(command, Adaptation):
+            _adapt(command)
+        else:
+            _navigate(command)
     except (RunError, SimulatorError, CheckpointError, ConfigError, OSError) as error:
         sys.exit(f"error: {error}")
 
@@ -153,6 +195,22 @@ def _predict(command: Prediction) -> None:
     if command.output:
         shown = {name: models[name] for name in command.models}
         prediction_report.write(command.output, rows, test, shown)
+
+
+def _adapt(command: Adaptation) -> None:
+    try:
+        drives, terrain = dataset.load(command.data, command.split)
+        drives = jax.tree.map(lambda x: x[:: command.every], drives)
+        index = adaptation.windows_on_soil(drives, terrain)
+    except ValueError as error:  # what is wrong with the drives, or with their maps
+        sys.exit(f"error: {error}")
+    model, params = choose(command.model, command.weights, "map")
+    wrong = adaptation.mistaken(terrain, PRESETS[command.wrong])
+    adapted = adaptation.adapt(command.filter, model, params, wrong, drives)
+    found = adaptation.errors(model, params, terrain, wrong, adapted, drives, index)
+    print(f"\n{adaptation.format_errors(found)}")
+    rows = adaptation.recovery(chrono_like(hmmwv()), terrain, wrong, adapted)
+    print(f"\n{adaptation.format_rows(rows)}" if rows else "\nno soil was driven on for long")
 
 
 def _compared(folders: Sequence[Path]) -> dict[str, tuple[Dynamics, Params]]:

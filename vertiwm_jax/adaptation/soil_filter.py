@@ -1,0 +1,226 @@
+"""Soils that the map has wrong, estimated while driving, the weights of the model frozen.
+
+A buffered extended Kalman filter: what a vehicle did in the last seconds is predicted once more
+from where it was, with the soils believed now, and where it really went corrects them.
+"""
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.scipy.special import logit
+
+from vertiwm_jax.adaptation import kalman
+from vertiwm_jax.adaptation.kalman import Gaussian
+from vertiwm_jax.dynamics import Dynamics, History, Params
+from vertiwm_jax.networks import soil_predictor
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model import motion
+from vertiwm_jax.world_model.model import VertiWM
+from vertiwm_jax.world_model.nesam import Nesam
+
+MARGIN = 0.05
+"""Share of `BOUNDS` from either end within which the filter starts: beyond, nothing would move."""
+LONGEST_STEP = 1.0
+"""Of an iteration, in logits: sinkage is far from linear in the moduli."""
+
+
+@struct.dataclass
+class SoilBelief:
+    """What is believed of K soils, and the last C + H steps of the drive that goes on.
+
+    soils: leaves `[K, 6]` and `[K, 6, 6]`, logits of where in `BOUNDS` each parameter lies; rows
+        of rigid classes are never used but finite.
+    states: `[C + H + 1, 12]`, the newest last. commands: `[C + H, 2]`, those between them.
+    steps: `[]` int32, of the drive so far.
+    accepted, refused: `[K]` int32, measurements of each class so far.
+    """
+
+    soils: Gaussian
+    states: jax.Array
+    commands: jax.Array
+    steps: jax.Array
+    accepted: jax.Array
+    refused: jax.Array
+
+
+@dataclass(frozen=True)
+class SoilFilter:
+    """Estimates the six parameters of `BOUNDS` of each class of soil from how the vehicle moves.
+
+    A measurement is where H steps have taken the vehicle, in its body frame, after a history of C
+    steps before them. It counts for the class below the vehicle in all of the H steps. What is
+    not measured for long returns to what the map says.
+    """
+
+    context: int = 8
+    """Recorded steps that the model sees first, C."""
+    horizon: int = 8
+    """Steps that it then predicts, H."""
+    prior: float = 1.5
+    """Standard deviation of what the map says, in logits."""
+    memory: float = 0.98
+    """Share of a deviation from the map that a measurement leaves to the next one; the rest is
+    forgotten, and what is known grows uncertain in step."""
+    noise: tuple[float, float, float, float, float, float] = (0.05, 0.05, 0.02, 0.02, 0.02, 0.02)
+    """Standard deviations of what the model misses in H steps with the right soil: ahead, to the
+    left and up, m, and about these axes, rad."""
+    gate: float = 22.5
+    """Largest squared Mahalanobis distance of a measurement that counts; 22.5 is 99.9 % of
+    chi-square with six degrees of freedom."""
+    iterations: int = 3
+    """Gauss-Newton steps of a measurement; 1 is the extended filter."""
+
+    def __post_init__(self):
+        for name, least in (("context", 0), ("horizon", 1), ("iterations", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, found {getattr(self, name)}")
+        for name in ("prior", "noise", "gate"):
+            if not np.min(getattr(self, name)) > 0:
+                raise ValueError(f"{name}: expected above 0, found {getattr(self, name)}")
+        if not 0 < self.memory <= 1:
+            raise ValueError(f"memory: expected above 0 and at most 1, found {self.memory}")
+
+    def init(self, terrain: TerrainMap, state: VehicleState) -> SoilBelief:
+        """The soils of the map, at the start of a drive."""
+        soils, steps = self._of_map(terrain), self.context + self.horizon
+        none = jnp.zeros(len(soils.mean), jnp.int32)
+        return SoilBelief(
+            soils=soils,
+            states=jnp.broadcast_to(state.vector, (steps + 1, 12)),
+            commands=jnp.zeros((steps, 2)),
+            steps=jnp.int32(0),
+            accepted=none,
+            refused=none,
+        )
+
+    def begin(self, belief: SoilBelief, state: VehicleState) -> SoilBelief:
+        """What is believed of the soils, at the start of another drive."""
+        states = jnp.broadcast_to(state.vector, belief.states.shape)
+        return replace(belief, states=states, steps=jnp.int32(0))
+
+    def update(
+        self,
+        model: Dynamics,
+        params: Params,
+        terrain: TerrainMap,
+        belief: SoilBelief,
+        state: VehicleState,
+        command: Command,
+    ) -> SoilBelief:
+        """The belief after one more step of 0.1 s: `command` was held and led to `state`.
+
+        Every H steps it measures; under `vmap`, which computes both sides of a condition, `record`
+        and `measure` called apart are cheaper. Raises like `measure`.
+        """
+        belief = self.record(belief, state, command)
+        return jax.lax.cond(
+            belief.steps % self.horizon == 0,
+            lambda: self.measure(model, params, terrain, belief),
+            lambda: belief,
+        )
+
+    def record(self, belief: SoilBelief, state: VehicleState, command: Command) -> SoilBelief:
+        """The belief with one more step in its buffer."""
+        return replace(
+            belief,
+            states=jnp.concatenate([belief.states[1:], state.vector[None]]),
+            commands=jnp.concatenate([belief.commands[1:], command.vector[None]]),
+            steps=belief.steps + 1,
+        )
+
+    def measure(
+        self, model: Dynamics, params: Params, terrain: TerrainMap, belief: SoilBelief
+    ) -> SoilBelief:
+        """The belief corrected by the H steps recorded last, once the drive has C + H steps.
+
+        terrain: the map as it was, of which only the soils are doubted. To measure more often than
+        every H steps would count them twice. Raises `ValueError` for a model that does not take
+        soils from the map.
+        """
+        model = _differentiable(model)
+        states = VehicleState.from_vector(belief.states)
+        start, end = (jax.tree.map(lambda x, i=i: x[i], states) for i in (0, -1))
+        commands = Command.from_vector(belief.commands)
+        given = jnp.arange(len(belief.commands)) <= self.context
+        kinds = query.surface(terrain, states.position[self.context :, :2]).semantic
+        kind = kinds[-1]
+        aged = self._aged(terrain, belief.soils)
+
+        def residual(mean: jax.Array) -> jax.Array:
+            """How the end of the buffer differs from what these logits of the soil predict."""
+            soils = replace(aged, mean=aged.mean.at[kind].set(mean))
+            ground = believed(terrain, replace(belief, soils=soils))
+
+            def advance(
+                carry: tuple[VehicleState, History], inputs: tuple[jax.Array, VehicleState, Command]
+            ) -> tuple[tuple[VehicleState, History], None]:
+                (state, history), (known, recorded, command) = carry, inputs
+                state = jax.tree.map(lambda x, y: jnp.where(known, x, y), recorded, state)
+                return model.step(params, ground, history, state, command), None
+
+            before = jax.tree.map(lambda x: x[:-1], states)
+            first = start, model.init(params, ground, start)
+            (predicted, _), _ = jax.lax.scan(advance, first, (given, before, commands))
+            return motion.increment(predicted, end) / jnp.asarray(self.noise)
+
+        posterior, plausible = kalman.correct(
+            jax.tree.map(lambda x: x[kind], aged),
+            residual,
+            self.gate,
+            self.iterations,
+            LONGEST_STEP,
+        )
+        counts = (
+            (belief.steps >= self.context + self.horizon)
+            & terrain.deformable[kind]
+            & jnp.all(kinds == kind)
+        )
+        corrected = jax.tree.map(lambda x, y: x.at[kind].set(y), aged, posterior)
+        return replace(
+            belief,
+            soils=jax.tree.map(lambda x, y: jnp.where(counts, x, y), corrected, aged),
+            accepted=belief.accepted.at[kind].add((counts & plausible).astype(jnp.int32)),
+            refused=belief.refused.at[kind].add((counts & ~plausible).astype(jnp.int32)),
+        )
+
+    def _of_map(self, terrain: TerrainMap) -> Gaussian:
+        """What the map says, leaves `[K, 6]` and `[K, 6, 6]`."""
+        shares = soil_predictor.shares(terrain.soils)
+        mean = logit(jnp.clip(shares, MARGIN, 1 - MARGIN))
+        one = self.prior**2 * jnp.eye(mean.shape[1])
+        return Gaussian(mean, jnp.broadcast_to(one, (*mean.shape, mean.shape[1])))
+
+    def _aged(self, terrain: TerrainMap, soils: Gaussian) -> Gaussian:
+        """What remains of a belief at the next measurement: a process that returns to the map."""
+        prior, kept = self._of_map(terrain), self.memory
+        return Gaussian(
+            prior.mean + kept * (soils.mean - prior.mean),
+            prior.covariance + kept**2 * (soils.covariance - prior.covariance),
+        )
+
+
+def believed(terrain: TerrainMap, belief: SoilBelief) -> TerrainMap:
+    """The map with the soils that are believed in: what a model is to drive on."""
+    shares = jax.nn.sigmoid(belief.soils.mean)
+    return replace(terrain, soils=soil_predictor.of_shares(shares, terrain.soils.unit_weight))
+
+
+def _differentiable(model: Dynamics) -> Dynamics:
+    """The same model, whose predictions have their exact gradient with respect to soils.
+
+    `ValueError` for one that predicts soils from what the ground looks like.
+    """
+    if isinstance(model, VertiWM):
+        return replace(model, nesam=_differentiable(model.nesam))
+    if isinstance(model, Nesam):
+        if model.soil != "map":
+            raise ValueError(
+                f"soil: expected 'map' to adapt the soils of the map, found {model.soil!r}"
+            )
+        return replace(model, gradient="exact")
+    return model
