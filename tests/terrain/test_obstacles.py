@@ -71,3 +71,26 @@ def test_unused_rows_are_no_obstacles_and_worlds_are_apart():
     assert at(jnp.array([0, 1])).tolist() == [False, False]
     hit = jax.vmap(lambda w: obstacles.collides(terrain.select(w), jnp.array([3, 4]), 0.0, 1, 1))
     assert hit(jnp.array([0, 1])).tolist() == [False, True]
+
+
+def test_the_gap_is_no_more_than_the_distance_and_the_same_beside_a_box():
+    rng = np.random.default_rng(1)
+    xy, yaw = rng.uniform(-9, 9, (60, 2)), rng.uniform(-4, 4, 60)
+    found = obstacles.gap(build(BOXES), jnp.array(xy), jnp.array(yaw), 4.6, 2.1)
+    touches = obstacles.collides(build(BOXES), jnp.array(xy), jnp.array(yaw), 4.6, 2.1)
+    np.testing.assert_array_equal(found <= 0, touches)
+    along = np.linspace(0, 1, 41)[:, None]
+    for i in np.flatnonzero(~touches):
+        outline = corners(*xy[i], yaw[i], 4.6, 2.1)
+        edges = np.concatenate(
+            [a + along * (b - a) for a, b in zip(outline, np.roll(outline, 1, 0), strict=True)]
+        )
+        apart = [np.abs(edges - box[:2]) - box[2:4] / 2 for box in BOXES[:3]]
+        nearest = min(np.linalg.norm(np.maximum(x, 0), axis=1).min() for x in apart)
+        assert 0 < found[i] <= nearest + 0.05
+        assert found[i] >= 0.7 * nearest - 0.05
+    terrain = build(np.array([[0, 0, 2, 4, 1]]))
+    for place, expected in (((6.0, 1.0), 2.7), ((0.0, -4.0), 0.95), ((3.0, 0.0), -0.3)):
+        beside = obstacles.gap(terrain, jnp.array(place), jnp.float32(0), 4.6, 2.1)
+        np.testing.assert_allclose(beside, expected, atol=1e-5)
+    assert obstacles.gap(build(np.zeros((0, 5))), jnp.zeros(2), jnp.float32(0), 4, 2) == np.inf

@@ -58,21 +58,22 @@ def reward(
         size = jnp.abs(angle)
         return size / config.tilt_limit * jnp.maximum(size - config.tilt_limit, 0.0)
 
-    terminal = {
-        Ending.TIMED_OUT: -config.timed_out - config.timed_out_distance * distance,
-        Ending.GOAL: config.goal,
-        Ending.STUCK: -config.stuck,
-    }
-    at_end = jnp.select(
-        [ending == Ending.RUNNING, *(ending == code for code in terminal)],
-        [0.0, *terminal.values()],
-        -config.failure,
-    )
     return (
         config.progress * progress
         - config.stalled * stalled
         - config.tilt * (tilt_penalty(roll) + tilt_penalty(pitch))
         - config.vertical * jnp.abs(vertical_speed)
         - config.disagreement * disagreement
-        + at_end
+        + ending_reward(config, ending, distance)
     )
+
+
+def ending_reward(config: RewardConfig, ending: jax.Array, distance: jax.Array) -> jax.Array:
+    """`[...]` of what an `Ending` code adds, `distance` m from the goal; 0 for `RUNNING`."""
+    named = {
+        Ending.RUNNING: 0.0,
+        Ending.TIMED_OUT: -config.timed_out - config.timed_out_distance * distance,
+        Ending.GOAL: config.goal,
+        Ending.STUCK: -config.stuck,
+    }
+    return jnp.select([ending == code for code in named], list(named.values()), -config.failure)
