@@ -57,6 +57,13 @@ def bicycle_env(
     return env, env.make_params(BICYCLE, terrain, tasks)
 
 
+def blocked(config: NavigationConfig) -> tuple[NavigationEnv, NavigationParams]:
+    """A goal straight ahead, behind a wall 3 m wide; and the same the other way."""
+    terrain = ground(obstacles=[[0.0, 0.0, 2.0, 3.0, 2.0]])
+    there, back = task((-20.0, 0.0), (20.0, 0.0)), task((20.0, 0.0), (-20.0, 0.0), jnp.pi)
+    return bicycle_env(terrain, jax.tree.map(lambda *x: jnp.concatenate(x), there, back), config)
+
+
 @dataclass(frozen=True)
 class Scripted:
     """Stands still while starts settle, then goes through states given as parameters.

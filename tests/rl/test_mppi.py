@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from env.worlds import BICYCLE, bicycle_env, ground, task
+from env import worlds
+from env.worlds import BICYCLE, ground, task
 
 from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
 from vertiwm_jax.env.termination import Ending
@@ -33,11 +34,7 @@ class Pulling(KinematicBicycle):
 
 @pytest.fixture(scope="module")
 def blocked():
-    """A goal straight ahead, behind a wall 3 m wide; and the same the other way."""
-    terrain = ground(obstacles=[[0.0, 0.0, 2.0, 3.0, 2.0]])
-    there, back = task((-20.0, 0.0), (20.0, 0.0)), task((20.0, 0.0), (-20.0, 0.0), jnp.pi)
-    both = jax.tree.map(lambda *x: jnp.concatenate(x), there, back)
-    return bicycle_env(terrain, both, CONFIG)
+    return worlds.blocked(CONFIG)
 
 
 def driver(env, **config):
@@ -111,7 +108,7 @@ def test_after_a_plan_it_goes_on_to_the_goal_at_a_steady_pace(blocked):
     near = state.goal - (8.0 + 3 * 4.0) * toward  # three decisions of 4 m from the goal's edge
     state = replace(state, vehicle=replace(state.vehicle, position=near))
     expected = (1 + 0.9 + 0.81) * 50.0 * 4.0 + 0.729 * 3000.0
-    assert float(planner._expected(state)) == pytest.approx(expected, rel=1e-3)
+    assert float(planner.expected(state)) == pytest.approx(expected, rel=1e-3)
 
 
 def test_many_decide_as_each_alone(blocked):

@@ -1,0 +1,101 @@
+"""What planners without a learned policy share: plans of decisions, and what a plan is worth."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from vertiwm_jax.env.navigation import NavigationParams, NavigationState
+from vertiwm_jax.env.observation import distance_and_bearing
+from vertiwm_jax.rl.imagining import Future, Imagining, Plan
+from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.world_model.choice import ModelName
+
+
+@dataclass(frozen=True)
+class OpenLoopConfig:
+    """What a planner imagines before it decides."""
+
+    candidates: int = 64
+    """Plans compared at every decision; the first is what was intended anyway."""
+    decisions: int = 6
+    """Decisions in a plan."""
+    interval: int = 8
+    """Steps of 0.1 s that a decision is held."""
+    spread: float = 0.5
+    """Standard deviation of the other plans about it, in units of half the action range."""
+    discount: float = 0.98
+    """Of rewards, for each decision."""
+    pace: float = 3.0
+    """Speed, m/s, at which a vehicle is expected to go on to the goal where a plan ends."""
+    model: ModelName = "nesam"
+    """What it imagines in: NeSAM predicts as well as the whole Verti-WM, many times faster."""
+
+    def __post_init__(self):
+        for name in ("candidates", "decisions", "interval"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
+        if self.spread < 0:
+            raise ValueError(f"spread: expected at least 0, found {self.spread}")
+        if self.pace <= 0:
+            raise ValueError(f"pace: expected more than 0, found {self.pace}")
+        if not 0 < self.discount < 1:
+            raise ValueError(f"discount: expected between 0 and 1, found {self.discount}")
+
+
+@struct.dataclass
+class OpenLoop(Imagining):
+    """Intends a sequence of decisions, of which one after the other is driven and then revised.
+
+    Plans are worth what the task returns, whose episodes end in imagination as they do in truth,
+    so that a plan that fails forgoes all that would have come.
+    """
+
+    config: OpenLoopConfig = struct.field(pytree_node=False)
+
+    @property
+    def interval(self) -> int:
+        """Steps that a decision is held."""
+        return self.config.interval
+
+    @property
+    def discount(self) -> float:
+        """For each decision."""
+        return self.config.discount
+
+    @property
+    def planned(self) -> int:
+        """All that was intended is kept."""
+        return self.config.decisions
+
+    def intended(self, memory: Plan) -> jax.Array:
+        """`[D, 2]` the plan moved on by a decision; after the last one it is the same again."""
+        return jnp.concatenate([memory.corrections[1:], memory.corrections[-1:]])
+
+    def imagine(
+        self,
+        params: NavigationParams,
+        observation: jax.Array,
+        state: NavigationState,
+        candidate: jax.Array,
+        key: jax.Array,
+    ) -> jax.Array:
+        """The discounted return `[]` of a plan `[D, 2]` and of what is expected after it."""
+
+        def advance(future: Future, inputs: tuple[jax.Array, jax.Array]) -> tuple[Future, None]:
+            return self.hold(params, future, *inputs), None
+
+        keys = jax.random.split(key, self.config.decisions)
+        future, _ = jax.lax.scan(advance, Future.of(observation, state), (candidate, keys))
+        return future.total + future.weight * self.expected(future.state)
+
+    def expected(self, state: NavigationState) -> jax.Array:
+        """The discounted return `[]` of going straight on to the goal, at a steady pace."""
+        reward, discount = self.env.config.reward, self.config.discount
+        distance, _ = distance_and_bearing(state.vehicle.position, state.goal)
+        left = jnp.maximum(distance - self.env.config.goal_radius, 0.0)
+        stride = self.config.pace * self.config.interval * STEP_SECONDS
+        at_goal = discount ** (left / stride)
+        on_the_way = reward.progress * stride * (1 - at_goal) / (1 - discount)
+        return on_the_way + reward.goal * at_goal
