@@ -1,0 +1,69 @@
+import gymnax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.env.gymnax import NAME
+from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.terrain.worlds import WorldConfig
+
+STEPS = 6
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Episodes of 3 steps on two level worlds."""
+    settings = {"relief": WorldConfig(("low",)), "number": 2, "starts": 5, "seed": 3}
+    return gymnax.make(NAME, config=NavigationConfig(horizon_seconds=0.3), **settings)
+
+
+def test_it_is_made_by_name():
+    assert NAME in gymnax.registered_envs
+
+
+def test_random_rollouts_in_gymnax_s_own_way(made):
+    env, env_params = made
+
+    def rollout(key):
+        key_reset, key_steps = jax.random.split(key)
+        observation, state = env.reset(key_reset, env_params)
+
+        def step(carry, key):
+            _, state = carry
+            key_action, key_step = jax.random.split(key)
+            action = env.action_space(env_params).sample(key_action)
+            observation, state, *result = env.step(key_step, state, action, env_params)
+            return (observation, state), (observation, *result)
+
+        keys = jax.random.split(key_steps, STEPS)
+        return jax.lax.scan(step, (observation, state), keys)[1]
+
+    seen, reward, terminated, truncated, info = jax.jit(jax.vmap(rollout))(
+        jax.random.split(jax.random.key(0), 4)
+    )
+    assert seen.shape == (4, STEPS, *env.observation_space(env_params).shape)
+    assert np.isfinite(seen).all() and np.isfinite(reward).all()
+    assert not terminated.any()
+    # Episodes are over after three steps, and begin anew.
+    np.testing.assert_array_equal(truncated, [[i % 3 == 2 for i in range(STEPS)]] * 4)
+    assert (info["ending"][:, 2] == Ending.TIMED_OUT).all()
+    assert len(np.unique(info["distance"][:, 2])) > 1
+
+
+def test_settings_decide_worlds_and_tasks(made):
+    env, env_params = made
+    assert env_params.terrain.worlds == 2 and env_params.pool_size == 5
+    again = env.default_params
+    np.testing.assert_array_equal(again.starts.goal, env_params.starts.goal)
+    np.testing.assert_array_equal(again.terrain.elevation, env_params.terrain.elevation)
+    other, params = gymnax.make(NAME, number=1, starts=2, relief=WorldConfig(("low",)))
+    assert other != env and params.terrain.worlds == 1
+    assert not jnp.array_equal(params.terrain.elevation[0], env_params.terrain.elevation[0])
+
+
+def test_a_model_that_does_not_exist_is_refused():
+    with pytest.raises(CheckpointError, match="expected bicycle, found"):
+        gymnax.make(NAME, model="bicycle")
