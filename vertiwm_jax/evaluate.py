@@ -38,6 +38,7 @@ from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.ground import Suite
 from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
+from vertiwm_jax.rl.shooting import Shooting, ShootingConfig
 from vertiwm_jax.runs import RunError
 from vertiwm_jax.sac import SACTraining
 from vertiwm_jax.simulators import chrono
@@ -45,7 +46,7 @@ from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.td3 import TD3Training
 from vertiwm_jax.terrain.soil import PRESETS
-from vertiwm_jax.world_model.choice import ModelName, choose, fitted
+from vertiwm_jax.world_model.choice import ModelName, choose, exact, fitted
 from vertiwm_jax.world_model.nesam import SoilSource
 
 ALGORITHMS: dict[str, type[TrainConfig]] = {
@@ -122,10 +123,12 @@ class Navigation:
     The worlds and tasks are those held out of the policy's training, unless others are asked for.
     """
 
-    policy: Literal["straight", "random", "mppi"] | Path
-    """Folder of a training run, or a controller that has learned nothing; mppi plans in a model."""
+    policy: Literal["straight", "random", "mppi", "shooting"] | Path
+    """Folder of a training run, or what has learned nothing: a controller, or a plan in a model."""
     mppi: MPPIConfig = MPPIConfig()
     """How it plans, and in which model, whatever moves the vehicle."""
+    shooting: ShootingConfig = ShootingConfig()
+    """The same of planning by gradients."""
     simulator: ModelName | Literal["chrono"] = "builtin"
     """What moves the vehicle; Chrono needs PyChrono, and drives one task after the other."""
     vehicle: str | None = None
@@ -245,6 +248,11 @@ def _navigate(command: Navigation) -> None:
         dynamics, weights = task.dynamics(config, command.mppi.model)
         env = NavigationEnv(dynamics, config.asked)
         policies = {"mppi": MPPI(env=env, dynamics=weights, config=command.mppi)} | policies
+    elif command.policy == "shooting":
+        dynamics, weights = task.dynamics(config, command.shooting.model)
+        env = NavigationEnv(exact(dynamics), config.asked)
+        shooting = Shooting(env=env, dynamics=weights, config=command.shooting)
+        policies = {"shooting": shooting} | policies
     elif command.policy == "straight":
         policies = {REFERENCE: policies[REFERENCE]}
     judge = navigation.evaluate

@@ -24,10 +24,13 @@ from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.networks.soil_predictor import SoilPredictor
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
-from vertiwm_jax.world_model import motion
+from vertiwm_jax.world_model import choice, motion
+from vertiwm_jax.world_model.model import VertiWM
 from vertiwm_jax.world_model.nesam import Nesam, calibrate
+from vertiwm_jax.world_model.perception import Sighted
 from vertiwm_jax.world_model.sizes import BASE
 from vertiwm_jax.world_model.specialist_network import WINDOW
+from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
 
 KEY, TERRAIN = jax.random.key(0), rough()
 PHYSICS = chrono_like(hmmwv())
@@ -263,3 +266,24 @@ def test_predicted_soils_are_those_of_the_predictor_wherever_it_drives():
     )
     np.testing.assert_array_equal(found, expected)
     assert float(jnp.abs(found - other).max()) > 1e-5
+
+
+def test_exact_lets_commands_move_what_the_mean_gradient_holds():
+    model = replace(SIMPLE, residual=False)
+    history = model.init(PARAMS, TERRAIN, driving())
+    command = Command(jnp.float32(2), jnp.float32(0.1))
+
+    def speed(model, command):
+        return model.step(PARAMS, TERRAIN, history, driving(), command)[0].velocity[0]
+
+    sharp = choice.exact(model)
+    np.testing.assert_array_equal(speed(model, command), speed(sharp, command))
+    assert jax.grad(speed, argnums=1)(model, command).speed == 0
+    np.testing.assert_allclose(jax.grad(speed, argnums=1)(sharp, command).speed, 0.1, rtol=1e-5)
+
+
+def test_exact_reaches_nesam_inside_other_models():
+    fused = VertiWM(TransformerSpecialist(TINY), MODEL)
+    assert choice.exact(fused) == replace(fused, nesam=replace(MODEL, gradient="exact"))
+    assert choice.exact(Sighted(fused)) == Sighted(choice.exact(fused))
+    assert choice.exact(Simulator()) == Simulator()

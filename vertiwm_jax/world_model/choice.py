@@ -9,8 +9,8 @@ from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
 from vertiwm_jax.world_model import model
-from vertiwm_jax.world_model.model import ModelConfig
-from vertiwm_jax.world_model.nesam import SoilSource
+from vertiwm_jax.world_model.model import ModelConfig, VertiWM
+from vertiwm_jax.world_model.nesam import Nesam, SoilSource
 from vertiwm_jax.world_model.perception import Eyes, Sighted, SightedParams
 
 ModelName = Literal["builtin", "transformer", "nesam", "vertiwm"]
@@ -57,6 +57,21 @@ def sighted(
 def eyes(weights: Path | None = None) -> Eyes:
     """The Transformer's encoders, by which policies see; raises like `sighted`."""
     return _eyes(weights)[1]
+
+
+def exact(dynamics: Dynamics) -> Dynamics:
+    """The same model, whose gradient goes through its physics as it is.
+
+    Fitting needs only how physics answers on the whole (`Nesam.gradient`); by that, commands would
+    move nothing. Values are the same.
+    """
+    if isinstance(dynamics, Nesam):
+        return replace(dynamics, gradient="exact")
+    if isinstance(dynamics, VertiWM) and isinstance(dynamics.nesam, Nesam):
+        return replace(dynamics, nesam=replace(dynamics.nesam, gradient="exact"))
+    if isinstance(dynamics, Sighted):
+        return replace(dynamics, dynamics=exact(dynamics.dynamics))
+    return dynamics
 
 
 def fitted(

@@ -1,0 +1,153 @@
+"""Planning without a learned policy: gradient ascent on plans, through the model."""
+
+from dataclasses import dataclass, replace
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from vertiwm_jax.env.navigation import NavigationParams, NavigationState
+from vertiwm_jax.env.observation import distance_and_bearing
+from vertiwm_jax.env.reward import ending_reward
+from vertiwm_jax.env.termination import Ending, edge_distance
+from vertiwm_jax.rl.imagining import Plan, around
+from vertiwm_jax.rl.open_loop import OpenLoop, OpenLoopConfig
+from vertiwm_jax.terrain import obstacles
+from vertiwm_jax.terrain.map import TerrainMap
+
+
+@dataclass(frozen=True)
+class ShootingConfig(OpenLoopConfig):
+    """What `Shooting` imagines before it decides, and how it improves the best of it."""
+
+    candidates: int = 32
+    """Plans compared at every decision; the first is what was intended anyway."""
+    improved: int = 4
+    """How many of them, the best, are improved."""
+    steps: int = 4
+    """Gradient steps by which each is improved."""
+    rate: float = 0.1
+    """Size of these steps, by Adam, in units of half the action range."""
+    clearance: float = 0.3
+    """Metres in which nearing an obstacle, the edge or the goal goes over into having met it."""
+    leeway: float = 0.1
+    """Radians in which tilting goes over into rolling over."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 1 <= self.improved <= self.candidates:
+            raise ValueError(
+                f"improved: expected 1 to the {self.candidates} candidates, found {self.improved}"
+            )
+        if self.steps < 0:
+            raise ValueError(f"steps: expected at least 0, found {self.steps}")
+        for name in ("rate", "clearance", "leeway"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name}: expected more than 0, found {getattr(self, name)}")
+
+
+@struct.dataclass
+class Shooting(OpenLoop):
+    """Drives by the best imagined plan, after its gradient has improved it.
+
+    Plans are drawn about the one that was intended, moved on by a decision. Those that return most
+    take steps up the gradient of a smooth return, through all steps of the model (single shooting);
+    what the task then returns chooses among them, before and after.
+
+    env: of a model whose gradients are exact, see `world_model.choice.exact`.
+    """
+
+    config: ShootingConfig = struct.field(pytree_node=False, default=ShootingConfig())
+
+    def decide(
+        self,
+        params: NavigationParams,
+        memory: Plan,
+        observation: jax.Array,
+        state: NavigationState,
+        key: jax.Array,
+    ) -> Plan:
+        """The best plan."""
+        config = self.config
+        noise_key, key = jax.random.split(key)
+        drawn = around(self.intended(memory), config.candidates, config.spread, noise_key)
+        drawn_returns = self.returns(params, memory, observation, state, drawn, key)
+        best_returns, best = jax.lax.top_k(drawn_returns, config.improved)
+        improved = self.improve(params, memory, state, drawn[best])
+        improved_returns = self.returns(params, memory, observation, state, improved, key)
+        plans = jnp.concatenate([drawn[best], improved])
+        chosen = jnp.argmax(jnp.concatenate([best_returns, improved_returns]))
+        return replace(memory, corrections=plans[chosen])
+
+    def improve(
+        self, params: NavigationParams, memory: Plan, state: NavigationState, plans: jax.Array
+    ) -> jax.Array:
+        """`[N, D, 2]` plans, each after `steps` of Adam up the gradient of its `smooth_return`.
+
+        Plans stay within [-1, 1], and as they are where a gradient is not finite.
+        """
+        inside = replace(params, dynamics=self.dynamics)
+        state = replace(state, history=memory.history)
+        optimiser = optax.adam(self.config.rate)
+        slope = jax.vmap(jax.grad(self.smooth_return, argnums=2), (None, None, 0))
+
+        def ascend(carry: tuple[jax.Array, optax.OptState], _: None) -> tuple[tuple, None]:
+            plans, memory = carry
+            gradient = slope(inside, state, plans)
+            usable = jnp.all(jnp.isfinite(gradient), axis=(1, 2), keepdims=True)
+            updates, memory = optimiser.update(jnp.where(usable, -gradient, 0.0), memory)
+            return (jnp.clip(plans + cast(jax.Array, updates), -1.0, 1.0), memory), None
+
+        carry = plans, optimiser.init(plans)
+        return jax.lax.scan(ascend, carry, length=self.config.steps)[0][0]
+
+    def smooth_return(
+        self, params: NavigationParams, state: NavigationState, plan: jax.Array
+    ) -> jax.Array:
+        """`[]` like the return of a plan `[D, 2]`, but endings come by degrees.
+
+        Where the task ends, at a distance or at an angle, an episode goes on here with a weight
+        that a sigmoid lets sink, and the ending's reward counts by what was lost: whoever nears a
+        rock feels it before the two touch. Standing still has no gradient.
+        """
+        env, reward = self.env, self.env.config.reward
+        discount = self.config.discount ** (1 / self.config.interval)
+        terrain = params.terrain.select(state.world)
+
+        def advance(carry: tuple, action: jax.Array) -> tuple[tuple, None]:
+            before, weight, total = carry
+            # Nothing in a step is random; what it observes is not computed.
+            _, after, gain, _, _ = env.step_env(jax.random.key(0), before, action, params)
+            distance, _ = distance_and_bearing(after.vehicle.position, after.goal)
+            ended = ending_reward(reward, after.ending, distance)
+            gain = gain - jnp.where(before.ending == Ending.RUNNING, ended, 0.0)
+            remains = jnp.float32(1)
+            for ending, share in self._nearness(terrain, after, distance).items():
+                gain = gain + share * ending_reward(reward, jnp.int32(ending), distance)
+                remains = remains * (1 - share)
+            return (after, weight * discount * remains, total + weight * gain), None
+
+        actions = jnp.repeat(plan, self.config.interval, axis=0)
+        start = state, jnp.float32(1), jnp.float32(0)
+        (end, weight, total), _ = jax.lax.scan(advance, start, actions)
+        return total + weight * self.expected(end)
+
+    def _nearness(
+        self, terrain: TerrainMap, state: NavigationState, distance: jax.Array
+    ) -> dict[Ending, jax.Array]:
+        """`[]` from 0 to 1 for endings at a distance or an angle, 1/2 where the task draws them."""
+        config, position = self.env.config, state.vehicle.position[:2]
+        roll, pitch, yaw = state.vehicle.rpy
+        tilt = jnp.maximum(jnp.abs(roll), jnp.abs(pitch))
+        chassis = config.chassis
+        gap = obstacles.gap(terrain, position, yaw, chassis.length, chassis.width)
+        beyond = {
+            Ending.GOAL: (config.goal_radius - distance) / self.config.clearance,
+            Ending.COLLIDED: -gap / self.config.clearance,
+            Ending.OFF_MAP: (config.map_margin - edge_distance(terrain, position))
+            / self.config.clearance,
+            Ending.ROLLED_OVER: (tilt - config.rollover_angle) / self.config.leeway,
+        }
+        return {ending: jax.nn.sigmoid(x) for ending, x in beyond.items()}
