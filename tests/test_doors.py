@@ -222,6 +222,10 @@ def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch
     small = ["--mppi.candidates", "2", "--mppi.decisions", "1", "--mppi.model", "builtin"]
     evaluate.main([*navigate, "mppi", "--suites", "easy", *small])
     assert "| mppi" in capsys.readouterr().out
+    small = ["candidates", "2", "improved", "1", "steps", "1", "decisions", "1", "model", "bicycle"]
+    options = [f"--shooting.{x}" if i % 2 == 0 else x for i, x in enumerate(small)]
+    evaluate.main([*navigate, "shooting", "--suites", "easy", *options])
+    assert "| shooting" in capsys.readouterr().out
 
 
 def test_a_policy_drives_another_vehicle(run, tmp_path, capsys):

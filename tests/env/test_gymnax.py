@@ -65,5 +65,5 @@ def test_settings_decide_worlds_and_tasks(made):
 
 
 def test_a_model_that_does_not_exist_is_refused():
-    with pytest.raises(CheckpointError, match="expected bicycle, found"):
-        gymnax.make(NAME, model="bicycle")
+    with pytest.raises(CheckpointError, match="expected unicycle, found"):
+        gymnax.make(NAME, model="unicycle")

@@ -10,7 +10,7 @@ from vertiwm_jax.env.navigation import NavigationParams, NavigationState
 from vertiwm_jax.env.observation import distance_and_bearing
 from vertiwm_jax.rl.imagining import Future, Imagining, Plan
 from vertiwm_jax.state import STEP_SECONDS
-from vertiwm_jax.world_model.choice import ModelName
+from vertiwm_jax.world_model.choice import Imagined
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class OpenLoopConfig:
     """Of rewards, for each decision."""
     pace: float = 3.0
     """Speed, m/s, at which a vehicle is expected to go on to the goal where a plan ends."""
-    model: ModelName = "nesam"
+    model: Imagined = "nesam"
     """What it imagines in: NeSAM predicts as well as the whole Verti-WM, many times faster."""
 
     def __post_init__(self):

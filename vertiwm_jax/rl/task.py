@@ -19,7 +19,7 @@ from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
 from vertiwm_jax.rl import ground
 from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.choice import ModelName, choose, sighted
+from vertiwm_jax.world_model.choice import Imagined, ModelName, choose, sighted
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def environment(
     return Task(env, env.make_params(params, terrain, pool))
 
 
-def dynamics(config: TaskConfig, model: ModelName) -> tuple[Dynamics, Params]:
+def dynamics(config: TaskConfig, model: Imagined) -> tuple[Dynamics, Params]:
     """One of the models, and its parameters."""
     if model == "builtin":
         chosen = config.simulator, chrono_like(config.driven.vehicle)

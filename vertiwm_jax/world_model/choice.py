@@ -6,6 +6,7 @@ from typing import Literal
 
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
 from vertiwm_jax.world_model import model
@@ -15,10 +16,12 @@ from vertiwm_jax.world_model.perception import Eyes, Sighted, SightedParams
 
 ModelName = Literal["builtin", "transformer", "nesam", "vertiwm"]
 """The simulator, which has learned nothing; either specialist; both of them fused."""
+Imagined = Literal["bicycle", "builtin", "transformer", "nesam", "vertiwm"]
+"""What a planner may imagine in: those, and a kinematic bicycle, which knows no forces."""
 
 
 def choose(
-    name: ModelName,
+    name: Imagined,
     weights: Path | None = None,
     soil: SoilSource | None = None,
     vehicle: Vehicle | None = None,
@@ -27,11 +30,13 @@ def choose(
 
     weights: folder of a fitted model; the one that comes with the package by default. soil: where
     NeSAM has soils from, if not from where it had them when it was fitted. vehicle: of the
-    simulator, the HMMWV by default; learned models move the one that they were fitted to. Raises
+    simulator and the bicycle, the HMMWV by default; learned models move the one that they were fitted to. Raises
     what `model.load` raises, and `CheckpointError` when it holds other parts alone.
     """
     if name == "builtin":
         return Simulator(), chrono_like(vehicle or hmmwv())
+    if name == "bicycle":
+        return KinematicBicycle(), bicycle_of(vehicle or hmmwv())
     folder = weights or model.PRETRAINED
     found = fitted(folder, soil)
     if name not in found:
@@ -40,7 +45,7 @@ def choose(
 
 
 def sighted(
-    name: ModelName, dynamics: Dynamics, params: Params, weights: Path | None = None
+    name: Imagined, dynamics: Dynamics, params: Params, weights: Path | None = None
 ) -> tuple[Dynamics, Params]:
     """A model of `choose` that sees by the Transformer's encoders, whatever it sees by itself.
 
