@@ -53,8 +53,9 @@ class Shooting(OpenLoop):
     """Drives by the best imagined plan, after its gradient has improved it.
 
     Plans are drawn about the one that was intended, moved on by a decision. Those that return most
-    take steps up the gradient of a smooth return, through all steps of the model (single shooting);
-    what the task then returns chooses among them, before and after.
+    take steps up the gradient of what they return, through all steps of the model (single
+    shooting). The return is a smooth one: of two plans that miss a rock, the one that keeps farther
+    from it returns more.
 
     env: of a model whose gradients are exact, see `world_model.choice.exact`.
     """
@@ -71,15 +72,20 @@ class Shooting(OpenLoop):
     ) -> Plan:
         """The best plan."""
         config = self.config
-        noise_key, key = jax.random.split(key)
-        drawn = around(self.intended(memory), config.candidates, config.spread, noise_key)
-        drawn_returns = self.returns(params, memory, observation, state, drawn, key)
-        best_returns, best = jax.lax.top_k(drawn_returns, config.improved)
-        improved = self.improve(params, memory, state, drawn[best])
-        improved_returns = self.returns(params, memory, observation, state, improved, key)
-        plans = jnp.concatenate([drawn[best], improved])
-        chosen = jnp.argmax(jnp.concatenate([best_returns, improved_returns]))
+        drawn = around(self.intended(memory), config.candidates, config.spread, key)
+        worth = self.worth(params, memory, state, drawn)
+        best = drawn[jax.lax.top_k(worth, config.improved)[1]]
+        plans = jnp.concatenate([best, self.improve(params, memory, state, best)])
+        chosen = jnp.argmax(self.worth(params, memory, state, plans))
         return replace(memory, corrections=plans[chosen])
+
+    def worth(
+        self, params: NavigationParams, memory: Plan, state: NavigationState, plans: jax.Array
+    ) -> jax.Array:
+        """`[N]` the `smooth_return` of plans `[N, D, 2]` from where the vehicle is."""
+        inside = replace(params, dynamics=self.dynamics)
+        state = replace(state, history=memory.history)
+        return jax.vmap(self.smooth_return, (None, None, 0))(inside, state, plans)
 
     def improve(
         self, params: NavigationParams, memory: Plan, state: NavigationState, plans: jax.Array
