@@ -123,7 +123,7 @@ def dynamics(config: TaskConfig, model: Imagined) -> tuple[Dynamics, Params]:
     if model == "builtin":
         chosen = config.simulator, chrono_like(config.driven.vehicle)
     else:
-        chosen = choose(model, config.weights)
+        chosen = choose(model, config.weights, vehicle=config.driven.vehicle)
     return sighted(model, *chosen, config.weights) if config.navigation.embeddings else chosen
 
 

@@ -29,8 +29,8 @@ def choose(
     """The model and its parameters.
 
     weights: folder of a fitted model; the one that comes with the package by default. soil: where
-    NeSAM has soils from, if not from where it had them when it was fitted. vehicle: of the
-    simulator and the bicycle, the HMMWV by default; learned models move the one that they were fitted to. Raises
+    NeSAM has soils from, if not from where it had them when it was fitted. vehicle: of simulator
+    and bicycle, the HMMWV by default; learned models move the one that they were fitted to. Raises
     what `model.load` raises, and `CheckpointError` when it holds other parts alone.
     """
     if name == "builtin":
