@@ -74,7 +74,6 @@ def main() -> None:
     arguments.add_argument("--configs", nargs="+", default=("ppo", "ppo_paper"))
     arguments.add_argument("--models", nargs="+", default=("builtin", "vertiwm"))
     chosen = arguments.parse_args()
-    devices.use_cores()
     idle = environment.EnvParams(max_steps_in_episode=600)
     results = {"algorithm alone": iteration(PPO(IdleEnv(), PPOTraining().ppo), idle)}
     for name in chosen.configs:

@@ -183,7 +183,6 @@ def main() -> None:
     arguments.add_argument("--batches", nargs="+", type=int, default=BATCHES)
     arguments.add_argument("--repeats", type=int, default=10, help="timed rollouts, at least")
     chosen = arguments.parse_args()
-    devices.use_cores()
     torch.set_num_threads(usable_threads())
     results: dict[str, Figures] = {}
     for batch in chosen.batches:

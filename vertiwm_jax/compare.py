@@ -8,7 +8,7 @@ from typing import Literal
 import tyro
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import devices, policy_training, runs
+from vertiwm_jax import policy_training, runs
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env.driver import Driver, Policy
 from vertiwm_jax.evaluate import ALGORITHMS
@@ -81,7 +81,6 @@ class CompareConfig:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
-    devices.use_cores()
     program = "python -m vertiwm_jax.compare"
     config = configuration.parse_resumable(CompareConfig, "table3", argv, program)
     keep_compiled(config.compile_cache)

@@ -11,7 +11,7 @@ import jax
 import tyro
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import devices, policy_training
+from vertiwm_jax import policy_training
 from vertiwm_jax.adaptation.soil_filter import SoilFilter
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
@@ -159,7 +159,6 @@ class Navigation:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
-    devices.use_cores()
     command = tyro.cli(
         Prediction | Adaptation | Navigation,
         args=argv,

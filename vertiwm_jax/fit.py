@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import devices, runs
+from vertiwm_jax import runs
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.learning import pipeline
 from vertiwm_jax.learning.pipeline import PipelineConfig
@@ -53,7 +53,6 @@ class FitConfig(PipelineConfig):
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
-    devices.use_cores()
     config = _configuration(argv)
     keep_compiled(config.compile_cache)
     with failures_in_one_line(ValueError):

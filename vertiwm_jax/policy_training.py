@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal, Protocol
 import jax
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import devices, runs
+from vertiwm_jax import runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.env.driver import Driver, Policy
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
@@ -91,7 +91,6 @@ class TrainConfig(TaskConfig, ABC):
 
 def main(kind: type[TrainConfig], argv: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
-    devices.use_cores()
     program = f"python -m vertiwm_jax.{kind.name}"
     config = configuration.parse_resumable(kind, kind.name, argv, program)
     with failures_in_one_line():
