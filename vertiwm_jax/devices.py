@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 T = TypeVar("T")
 
@@ -53,6 +53,11 @@ def everywhere(mesh: Mesh, tree: T) -> T:
     return jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
 
 
+def in_one_place(tree: T) -> T:
+    """A pytree of arrays that are on one device, and whose types know of no mesh any more."""
+    return jax.device_put(tree, SingleDeviceSharding(jax.devices()[0]))
+
+
 def shared_out(function: Callable[..., T], batch: int) -> Callable[..., T]:
     """A compiled function that spreads batches of this size; its results are on one device."""
 
@@ -60,7 +65,7 @@ def shared_out(function: Callable[..., T], batch: int) -> Callable[..., T]:
         over = mesh(batch)
         with jax.set_mesh(over):
             result = function(*everywhere(over, args))
-        return jax.device_put(result, jax.devices()[0])
+        return in_one_place(result)
 
     return on_mesh
 

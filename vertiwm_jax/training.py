@@ -162,7 +162,7 @@ def train(
             f"stopped after iteration {done} of {iterations}, all saved; "
             f"go on with --resume {run.outermost}"
         )
-    return jax.device_put(state, jax.devices()[0])
+    return devices.in_one_place(state)
 
 
 def _mean(values: np.ndarray) -> float | None:

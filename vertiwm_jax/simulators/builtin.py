@@ -1,13 +1,16 @@
 """The built-in simulator as a source of drives."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
 from vertiwm_jax import geometry
+from vertiwm_jax.env import tasks
+from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.learning.dataset import Auxiliary
-from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.mechanics.simulator import (
     GroundForces,
     Simulator,
@@ -40,11 +43,12 @@ class BuiltIn:
 
     def __init__(self, terrain: TerrainMap, vehicle: Vehicle | None = None) -> None:
         self._terrain, self._params = terrain, chrono_like(vehicle or hmmwv())
+        self._chassis = Chassis.of(vehicle) if vehicle else Chassis()
 
     def start(self, x: float, y: float, yaw: float) -> Observation:
         """As `Simulator.start`."""
         pose = np.array([x, y, yaw], np.float32)
-        self._moving = _place(self._params, self._terrain, pose)
+        self._moving = _place(self._params, self._terrain, self._chassis, pose)
         for _ in range(round(SETTLE_SECONDS / STEP_SECONDS) - 1):
             self.step(np.zeros(2))
         return self.step(np.zeros(2))
@@ -56,12 +60,11 @@ class BuiltIn:
         return jax.device_get(seen)
 
 
-@jax.jit
-def _place(params: SimulatorParams, terrain: TerrainMap, pose: jax.Array) -> _Moving:
-    vehicle, still = params.vehicle, jnp.zeros(3)
-    sizes = vehicle.wheelbase, vehicle.track, vehicle.wheel_radius
-    position, rpy = rest_on_ground(terrain, pose[:2], pose[2], *sizes)
-    state = VehicleState(position, rpy, still, still)
+@partial(jax.jit, static_argnames="chassis")
+def _place(
+    params: SimulatorParams, terrain: TerrainMap, chassis: Chassis, pose: jax.Array
+) -> _Moving:
+    state = tasks.place(terrain, chassis, pose[:2], pose[2])
     history, none = DYNAMICS.init(params, terrain, state), jnp.zeros((4, 3))
     return _Moving(state, history, GroundForces(none, none[0]))
 
