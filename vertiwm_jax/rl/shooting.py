@@ -16,6 +16,7 @@ from vertiwm_jax.rl.imagining import Plan, around
 from vertiwm_jax.rl.open_loop import OpenLoop, OpenLoopConfig
 from vertiwm_jax.terrain import obstacles
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model.choice import Imagined
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ class ShootingConfig(OpenLoopConfig):
     """Metres in which nearing an obstacle, the edge or the goal goes over into having met it."""
     leeway: float = 0.1
     """Radians in which tilting goes over into rolling over."""
+    model: Imagined = "bicycle"
+    """What it imagines in; the gradient of NeSAM takes minutes to compile, the bicycle's seconds."""
 
     def __post_init__(self):
         super().__post_init__()
