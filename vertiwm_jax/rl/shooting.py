@@ -36,7 +36,7 @@ class ShootingConfig(OpenLoopConfig):
     leeway: float = 0.1
     """Radians in which tilting goes over into rolling over."""
     model: Imagined = "bicycle"
-    """What it imagines in; the gradient of NeSAM takes minutes to compile, the bicycle's seconds."""
+    """What it imagines in; NeSAM's gradient takes minutes to compile, the bicycle's seconds."""
 
     def __post_init__(self):
         super().__post_init__()
