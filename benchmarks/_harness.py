@@ -14,6 +14,8 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
+from vertiwm_jax import devices
+
 Figures = Mapping[str, float | int | str]
 
 
@@ -58,7 +60,7 @@ def hardware() -> dict[str, str | int]:
     return {
         "cpu": _cpu_model(),
         "cores": os.cpu_count() or 1,
-        "threads": usable_threads(),
+        "threads": devices.cores(),
         "device": f"{device.platform}: {device.device_kind}",
         "jax": jax.__version__,
         "python": platform.python_version(),
@@ -93,13 +95,6 @@ def cell(value: float | int | str) -> str:
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
     return f"{value:,}" if isinstance(value, int) else value
-
-
-def usable_threads() -> int:
-    """Cores that this process may use."""
-    # Affinity is Linux only; elsewhere every core may be used.
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def _cpu_model() -> str:

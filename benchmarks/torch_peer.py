@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-from benchmarks._harness import Figures, measure, parser, report, usable_threads
+from benchmarks._harness import Figures, measure, parser, report
 from benchmarks.peers.torch_query import Ground, tensor
 from benchmarks.peers.torch_vertiwm import TorchVertiWM
 from vertiwm_jax import devices
@@ -183,7 +183,7 @@ def main() -> None:
     arguments.add_argument("--batches", nargs="+", type=int, default=BATCHES)
     arguments.add_argument("--repeats", type=int, default=10, help="timed rollouts, at least")
     chosen = arguments.parse_args()
-    torch.set_num_threads(usable_threads())
+    torch.set_num_threads(devices.cores())
     results: dict[str, Figures] = {}
     for batch in chosen.batches:
         results |= rates(chosen.ways, batch, chosen.repeats)

@@ -22,14 +22,19 @@ FEWEST = 8
 _PATIENCE = 7 * 24 * 3600  # seconds
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    # Affinity is Linux only; elsewhere every core may be used.
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
 def use_cores() -> None:
     """Makes every core of a CPU a device, unless JAX has started or `JAX_NUM_CPU_DEVICES` is set.
 
     Two devices of one core each are faster than one of two cores, whose cores wait for each other
     after every operation (docs/performance.md).
     """
-    affinity = getattr(os, "sched_getaffinity", None)  # of this process; Linux only
-    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
     # Where another program takes one core, the others wait; after 60 s XLA would end the process.
     for flag in ("warn_stuck", "terminate"):
         name = f"--xla_cpu_collective_call_{flag}_timeout_seconds"
@@ -38,7 +43,7 @@ def use_cores() -> None:
             os.environ["XLA_FLAGS"] = f"{flags} {name}={_PATIENCE}".strip()
     if "JAX_NUM_CPU_DEVICES" not in os.environ:
         with contextlib.suppress(RuntimeError):  # It has started: its devices are what they are.
-            jax.config.update("jax_num_cpu_devices", cores)
+            jax.config.update("jax_num_cpu_devices", cores())
 
 
 def mesh(batch: int) -> Mesh:

@@ -20,6 +20,7 @@ from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import motion
+from vertiwm_jax.world_model.choice import exact
 from vertiwm_jax.world_model.model import VertiWM
 from vertiwm_jax.world_model.nesam import Nesam
 
@@ -215,12 +216,9 @@ def _differentiable(model: Dynamics) -> Dynamics:
 
     `ValueError` for one that predicts soils from what the ground looks like.
     """
-    if isinstance(model, VertiWM):
-        return replace(model, nesam=_differentiable(model.nesam))
-    if isinstance(model, Nesam):
-        if model.soil != "map":
-            raise ValueError(
-                f"soil: expected 'map' to adapt the soils of the map, found {model.soil!r}"
-            )
-        return replace(model, gradient="exact")
-    return model
+    nesam = model.nesam if isinstance(model, VertiWM) else model
+    if isinstance(nesam, Nesam) and nesam.soil != "map":
+        raise ValueError(
+            f"soil: expected 'map' to adapt the soils of the map, found {nesam.soil!r}"
+        )
+    return exact(model)

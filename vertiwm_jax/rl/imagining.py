@@ -113,10 +113,15 @@ class Imagining(Driver):
         key: jax.Array,
     ) -> jax.Array:
         """`[N]` what candidates `[N, ...]` would return from where the vehicle is."""
-        inside = replace(params, dynamics=self.dynamics)
-        state = replace(state, history=memory.history)
+        params, state = self.inside(params, memory, state)
         each = jax.vmap(self.imagine, (None, None, None, 0, None))
-        return each(inside, observation, state, candidates, key)
+        return each(params, observation, state, candidates, key)
+
+    def inside(
+        self, params: NavigationParams, memory: Plan, state: NavigationState
+    ) -> tuple[NavigationParams, NavigationState]:
+        """The task as it is now, inside the model."""
+        return replace(params, dynamics=self.dynamics), replace(state, history=memory.history)
 
     def hold(
         self, params: NavigationParams, future: Future, correction: jax.Array, key: jax.Array

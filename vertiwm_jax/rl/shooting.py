@@ -86,9 +86,8 @@ class Shooting(OpenLoop):
         self, params: NavigationParams, memory: Plan, state: NavigationState, plans: jax.Array
     ) -> jax.Array:
         """`[N]` the `smooth_return` of plans `[N, D, 2]` from where the vehicle is."""
-        inside = replace(params, dynamics=self.dynamics)
-        state = replace(state, history=memory.history)
-        return jax.vmap(self.smooth_return, (None, None, 0))(inside, state, plans)
+        params, state = self.inside(params, memory, state)
+        return jax.vmap(self.smooth_return, (None, None, 0))(params, state, plans)
 
     def improve(
         self, params: NavigationParams, memory: Plan, state: NavigationState, plans: jax.Array
@@ -97,14 +96,13 @@ class Shooting(OpenLoop):
 
         Plans stay within [-1, 1], and as they are where a gradient is not finite.
         """
-        inside = replace(params, dynamics=self.dynamics)
-        state = replace(state, history=memory.history)
+        params, state = self.inside(params, memory, state)
         optimiser = optax.adam(self.config.rate)
         slope = jax.vmap(jax.grad(self.smooth_return, argnums=2), (None, None, 0))
 
         def ascend(carry: tuple[jax.Array, optax.OptState], _: None) -> tuple[tuple, None]:
             plans, memory = carry
-            gradient = slope(inside, state, plans)
+            gradient = slope(params, state, plans)
             usable = jnp.all(jnp.isfinite(gradient), axis=(1, 2), keepdims=True)
             updates, memory = optimiser.update(jnp.where(usable, -gradient, 0.0), memory)
             return (jnp.clip(plans + cast(jax.Array, updates), -1.0, 1.0), memory), None
