@@ -11,7 +11,7 @@ import jax
 import tyro
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import policy_training
+from vertiwm_jax import policy_training, runs
 from vertiwm_jax.adaptation.soil_filter import SoilFilter
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
@@ -19,8 +19,10 @@ from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.evaluation import (
     adaptation,
+    calibration,
     navigation,
     outside,
+    plots,
     prediction,
     prediction_report,
     report,
@@ -117,6 +119,30 @@ class Adaptation:
 
 
 @dataclass(frozen=True)
+class Calibration:
+    """How far off predictions of Verti-WM are, by how much its specialists disagree.
+
+    Bounds on the error are found from the validation drives, and tried on the test drives.
+    """
+
+    data: Path
+    """Folder of `.npz` files of drives, with the maps they name."""
+    weights: Path | None = None
+    """Folder of a fitted model, instead of the one that comes with the package."""
+    context: int = 16
+    """Recorded steps that the model sees first."""
+    horizon: int = 16
+    """Steps that it predicts."""
+    output: Path | None = None
+    """Folder for tables and a picture."""
+
+    def __post_init__(self):
+        for name, least in (("context", 0), ("horizon", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, found {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
 class Navigation:
     """Success, time, roll and pitch of a policy, on worlds that it was not trained on.
 
@@ -160,7 +186,7 @@ class Navigation:
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
     command = tyro.cli(
-        Prediction | Adaptation | Navigation,
+        Prediction | Adaptation | Calibration | Navigation,
         args=argv,
         prog="python -m vertiwm_jax.evaluate",
         description=__doc__,
@@ -171,6 +197,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             _predict(command)
         elif isinstance(command, Adaptation):
             _adapt(command)
+        elif isinstance(command, Calibration):
+            _calibrate(command)
         else:
             _navigate(command)
     except (RunError, SimulatorError, CheckpointError, ConfigError, OSError) as error:
@@ -213,6 +241,31 @@ def _adapt(command: Adaptation) -> None:
     print(f"\n{adaptation.format_errors(found)}")
     rows = adaptation.recovery(chrono_like(hmmwv()), terrain, wrong, adapted)
     print(f"\n{adaptation.format_rows(rows)}" if rows else "\nno soil was driven on for long")
+
+
+def _calibrate(command: Calibration) -> None:
+    lengths = command.context, command.horizon, command.horizon
+    try:
+        measured, tested = (
+            TestWindows.of(*dataset.load(command.data, split), *lengths)
+            for split in ("validation", "test")
+        )
+        model = choose("vertiwm", command.weights)
+        before, found = (calibration.signs(*model, test) for test in (measured, tested))
+    except ValueError as error:  # what is wrong with drives, maps, or predictions
+        sys.exit(f"error: {error}")
+    bounds = {
+        "disagreement": calibration.Calibration.measure(*before),
+        "nothing": calibration.Calibration.measure(before[0], None),
+    }
+    rows = {name: calibration.coverage(each, *found) for name, each in bounds.items()}
+    tables = [calibration.format_parts(*found), calibration.format_coverage(rows)]
+    print("\n" + "\n\n".join(tables))
+    if command.output:
+        command.output.mkdir(parents=True, exist_ok=True)
+        runs.write_atomic(command.output / "calibration.md", "\n\n".join(tables) + "\n")
+        figure = calibration.picture(bounds["disagreement"], *found, bounds["nothing"])
+        plots.save(figure, command.output / "calibration.png")
 
 
 def _compared(folders: Sequence[Path]) -> dict[str, tuple[Dynamics, Params]]:

@@ -1,0 +1,91 @@
+"""Bounds on errors, on errors whose size is known, and on predictions whose errors are."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from vertiwm_jax.evaluation import calibration
+from vertiwm_jax.evaluation.calibration import LEVELS, Calibration
+from vertiwm_jax.evaluation.prediction import TestWindows
+from vertiwm_jax.learning.windows import Windows
+from vertiwm_jax.terrain import map as terrain_map
+
+
+def errors(seed, count=40_000):
+    """Errors, m, of a size that grows with the disagreement, and the disagreements."""
+    random = np.random.default_rng(seed)
+    disagreement = random.uniform(0.01, 0.05, count)
+    return (0.02 + 4 * disagreement) * random.exponential(size=count), disagreement
+
+
+def test_bounds_hold_as_often_as_they_say_at_every_disagreement():
+    found = Calibration.measure(*errors(0))
+    assert (found.intercept, found.slope) == pytest.approx((0.02, 4.0), rel=0.25)
+    for row in calibration.coverage(found, *errors(1)):
+        np.testing.assert_allclose(row.parts, row.level, atol=0.05)
+        assert row.held == pytest.approx(row.level, abs=0.02)
+
+
+def test_the_quantiles_of_exponential_errors():
+    found = Calibration.measure(*errors(0))
+    for level in LEVELS:
+        expected = -np.log(1 - level) * (0.02 + 4 * 0.03)
+        assert found.bound(np.array([0.03]), level)[0] == pytest.approx(expected, rel=0.1)
+
+
+def test_one_bound_for_all_holds_too_often_where_there_is_least_disagreement():
+    error, _ = errors(0)
+    found = Calibration.measure(error, None)
+    for row in calibration.coverage(found, *errors(1)):
+        assert row.held == pytest.approx(row.level, abs=0.02)
+        assert row.parts[0] > row.level > row.parts[-1]
+
+
+def test_parts_are_fifths_in_the_order_of_disagreement():
+    disagreement = np.array([5.0, 1.0, 4.0, 2.0, 3.0])
+    table = calibration.format_parts(10 * disagreement, disagreement)
+    assert "| mean error, m | 10.000 | 20.000 | 30.000 | 40.000 | 50.000 |" in table
+
+
+@struct.dataclass
+class Step:
+    count: object
+    disagreement: object
+
+
+class Standing:
+    """Never moves, and disagrees with itself in the fifth step alone."""
+
+    def init(self, params, terrain, state):
+        return Step(jnp.int32(0), jnp.float32(0))
+
+    def step(self, params, terrain, history, state, command):
+        count = history.count + 1
+        apart = jnp.where(count == 5, params, jnp.float32(0))
+        state = replace(state, position=state.position + 0 * params)
+        return state, Step(count, apart)
+
+
+def standing(windows=3, context=2, horizon=4):
+    """Windows of vehicles that drive 1, 2, ... m in the last step."""
+    state = np.zeros((windows, context + horizon + 1, 12), np.float32)
+    state[:, -1, 0] = 1 + np.arange(windows)
+    control = np.zeros((windows, context + horizon, 2), np.float32)
+    none = np.zeros(windows, np.int32)
+    ground = terrain_map.build(np.zeros((65, 65)), np.full((8, 8), 3))
+    arrays = (jnp.asarray(x) for x in (state, control, none, none))
+    return TestWindows(Windows(*arrays, context), none, ground)
+
+
+def test_errors_and_the_largest_disagreement_are_those_of_the_predicted_steps():
+    error, largest = calibration.signs(Standing(), jnp.float32(0.25), standing())
+    np.testing.assert_allclose(error, [1, 2, 3], rtol=1e-6)
+    np.testing.assert_allclose(largest, 0.25)
+
+
+def test_a_prediction_that_is_not_finite_is_an_error():
+    with pytest.raises(ValueError, match="found 3 of 3 that are not"):
+        calibration.signs(Standing(), jnp.float32(np.nan), standing())

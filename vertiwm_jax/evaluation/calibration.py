@@ -1,0 +1,182 @@
+"""Whether disagreement of the specialists tells how far off a prediction is, in metres.
+
+Where two models that fail for different reasons disagree, one of them is wrong at least
+(Lakshminarayanan et al., 2017, of ensembles). How far off both are, recorded drives have to tell:
+the scale and the quantiles are measured on some drives, and checked on others, as in split
+conformal prediction with normalised scores (Lei et al., 2018).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Self
+
+import jax
+import numpy as np
+
+from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.evaluation.plots import line, sheet, style
+from vertiwm_jax.evaluation.prediction import BATCH, TestWindows
+from vertiwm_jax.learning.rollouts import open_loop
+from vertiwm_jax.learning.windows import Windows
+from vertiwm_jax.terrain.map import TerrainMap
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+"""Shares of predictions that a bound is to hold for."""
+PARTS = 5
+"""Equal parts of the windows, by how much the specialists disagree, that are looked at apart."""
+_LEAST = 1e-3  # m, of a scale
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A bound on an error e for each level: quantile(level) of e / scale, times the scale.
+
+    intercept, slope: of the scale, m and m per m, over the largest disagreement of a prediction.
+    scores: errors over their scales, of the drives that it was measured on, in order.
+    """
+
+    intercept: float
+    slope: float
+    scores: np.ndarray
+
+    @classmethod
+    def measure(cls, error: np.ndarray, disagreement: np.ndarray | None) -> Self:
+        """From errors `[N]`, m, and disagreements `[N]`, m; without these, one bound for all."""
+        slope, intercept = 0.0, float(np.mean(error))
+        if disagreement is not None:
+            slope, intercept = (float(x) for x in np.polyfit(disagreement, error, 1))
+        scaled = cls(intercept, slope, np.empty(0))
+        scale = scaled.scale(np.zeros_like(error) if disagreement is None else disagreement)
+        return cls(intercept, slope, np.sort(error / scale))
+
+    def scale(self, disagreement: np.ndarray) -> np.ndarray:
+        """Of errors, m; `[N]` of disagreements `[N]`, m."""
+        return np.maximum(self.intercept + self.slope * disagreement, _LEAST)
+
+    def bound(self, disagreement: np.ndarray, level: float) -> np.ndarray:
+        """What a share `level` of errors is below, m; `[N]` of disagreements `[N]`, m."""
+        return np.quantile(self.scores, level) * self.scale(disagreement)
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How often bounds of one level held.
+
+    level: what they were to hold for; held: share of all windows; parts: `[PARTS]` the same, from
+    the windows with least disagreement to those with most; mean_bound: m.
+    """
+
+    level: float
+    held: float
+    parts: tuple[float, ...]
+    mean_bound: float
+
+
+def signs(model: Dynamics, params: Params, test: TestWindows) -> tuple[np.ndarray, np.ndarray]:
+    """Position error after the last step, and the largest disagreement before: `[N]` each, m.
+
+    Of a model whose history holds its disagreement, as Verti-WM's does. `ValueError` if a
+    prediction is not finite.
+    """
+    last, largest = _rolled(model, params, test.terrain, test.windows)
+    error = np.linalg.norm(np.asarray(last - test.windows.state[:, -1, :3]), axis=-1)
+    if lost := int(np.sum(~np.isfinite(error))):
+        raise ValueError(f"expected finite predictions, found {lost} of {len(error)} that are not")
+    return error, np.asarray(largest)
+
+
+@partial(jax.jit, static_argnames="model")
+def _rolled(
+    model: Dynamics, params: Params, terrain: TerrainMap, windows: Windows
+) -> tuple[jax.Array, jax.Array]:
+    """Last positions `[N, 3]` and largest disagreements `[N]`, m."""
+
+    def one(window: Windows) -> tuple[jax.Array, jax.Array]:
+        ground = terrain.select(window.world)
+        states, apart = open_loop(model, params, ground, window, lambda h: h.disagreement)
+        return states.position[-1], apart.max()
+
+    return jax.lax.map(one, windows, batch_size=BATCH)
+
+
+def coverage(
+    calibration: Calibration, error: np.ndarray, disagreement: np.ndarray
+) -> list[Coverage]:
+    """How often its bounds held for errors `[N]`, m, of predictions with disagreements `[N]`, m."""
+    parts = np.array_split(np.argsort(disagreement, kind="stable"), PARTS)
+    rows = []
+    for level in LEVELS:
+        bound = calibration.bound(disagreement, level)
+        held = error <= bound
+        by_part = tuple(float(held[part].mean()) for part in parts)
+        rows.append(Coverage(level, float(held.mean()), by_part, float(bound.mean())))
+    return rows
+
+
+def format_parts(error: np.ndarray, disagreement: np.ndarray) -> str:
+    """A Markdown table of errors `[N]` by disagreements `[N]`, m."""
+    parts = np.array_split(np.argsort(disagreement, kind="stable"), PARTS)
+    rows = {
+        "largest disagreement in a step, m": [disagreement[part].mean() for part in parts],
+        "mean error, m": [error[part].mean() for part in parts],
+        "95 % of errors below, m": [np.quantile(error[part], 0.95) for part in parts],
+    }
+    heads = ["least disagreement", *[""] * (PARTS - 2), "most"]
+    lines = [f"| windows | {' | '.join(heads)} |", "|" + "---|" * (PARTS + 1)]
+    lines += [f"| {name} | {' | '.join(f'{x:.3f}' for x in row)} |" for name, row in rows.items()]
+    return "\n".join(lines)
+
+
+def format_coverage(rows: Mapping[str, Sequence[Coverage]]) -> str:
+    """A Markdown table of how often bounds held, by how they were found."""
+    heads = ["bound for", "found from", "mean bound, m", "held for", "by disagreement, least first"]
+    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    for at_level in zip(*rows.values(), strict=True):
+        for name, row in zip(rows, at_level, strict=True):
+            parts = " / ".join(f"{part:.0%}" for part in row.parts)
+            cells = [f"{row.level:.0%}", name, f"{row.mean_bound:.3f}", f"{row.held:.1%}", parts]
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def picture(
+    calibration: Calibration, error: np.ndarray, disagreement: np.ndarray, constant: Calibration
+) -> Figure:
+    """Errors over disagreement with their bounds, and how often bounds of any level hold.
+
+    The second panel is of the fifths with least and with most disagreement, for bounds that know
+    of it and for those that do not: on the diagonal, a bound holds as often as it says.
+    """
+    order = np.argsort(disagreement, kind="stable")
+    ends = np.array_split(order, PARTS)[0], np.array_split(order, PARTS)[-1]
+    levels = np.linspace(0.02, 0.98, 49)
+    with style():
+        figure = sheet(7.2, 3.5)
+        left, right = figure.subplots(1, 2)
+        left.plot(disagreement, error, ".", color="0.6", markersize=2.5)
+        for i, level in enumerate(LEVELS):
+            colour, dash = line(i)
+            bounds = calibration.bound(disagreement[order], level)
+            left.plot(
+                disagreement[order], bounds, dash, color=colour, label=f"bound for {level:.0%}"
+            )
+        left.set(xlabel="largest disagreement in a step [m]", ylabel="position error [m]")
+        left.set(xscale="log", yscale="log", ylim=(np.quantile(error, 0.005), None))
+        for i, (name, bounds) in enumerate({"": calibration, "not ": constant}.items()):
+            colour, _ = line(i)
+            for end, rows, dash in (("least", ends[0], "-"), ("most", ends[1], "--")):
+                limits = [bounds.bound(disagreement[rows], level) for level in levels]
+                held = [np.mean(error[rows] <= limit) for limit in limits]
+                label = f"{name}from disagreement, where it is {end}"
+                right.plot(levels, held, dash, color=colour, label=label)
+        right.plot([0, 1], [0, 1], color="0.6", linewidth=0.8)
+        right.set(xlabel="level of the bound", ylabel="share of errors below it")
+        for axes in (left, right):
+            axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize=7)
+    return figure
