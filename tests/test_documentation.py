@@ -1,8 +1,11 @@
 """What the documentation shows is true: its examples run, and its commands exist."""
 
 import importlib
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -34,6 +37,28 @@ def test_examples_run_from_top_to_bottom(name, tmp_path, monkeypatch):
     assert found
     for block in found:
         exec(compile(block, name, "exec"), names)
+
+
+@pytest.mark.slow
+def test_your_own_map_from_top_to_bottom(tmp_path, monkeypatch):
+    """Every line as it stands, examples and commands, in a folder of its own: 15 minutes."""
+    monkeypatch.chdir(tmp_path)
+    users = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    users["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), users.get("PYTHONPATH")]))
+    names, run = {"__name__": "example"}, "ppo-<date>-<time>"
+    page = (ROOT / "docs/own-map.md").read_text(encoding="utf-8")
+    for language, block in re.findall(r"```(\w+)\n(.*?)```", page, re.DOTALL):
+        if language == "python":
+            exec(compile(block, "own-map.md", "exec"), names)
+            continue
+        for line in block.splitlines():
+            if run in line:
+                line = line.replace(run, max(Path("runs").glob("ppo-*")).name)
+            python, *rest = shlex.split(line)
+            assert python == "python"
+            subprocess.run([sys.executable, *rest], check=True, env=users)
+    (trained,) = Path("runs").glob("ppo-*")
+    assert {"summary.md", "learning_curves.png"} <= {file.name for file in trained.iterdir()}
 
 
 def commands():
