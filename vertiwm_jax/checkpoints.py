@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 from orbax.checkpoint import v1 as ocp
+
+from vertiwm_jax import hosts
 
 State = TypeVar("State")
 
@@ -23,17 +25,20 @@ class CheckpointError(RuntimeError):
 def save(folder: str | Path, step: int, state: Any, keep: int) -> Path:
     """Write `state` as `folder/step` and then delete all but the newest `keep` checkpoints.
 
-    state: any pytree of non-empty arrays, random keys included.
+    state: any pytree of non-empty arrays, random keys included, whole on every device. Of several
+        hosts the first one writes.
     Until a checkpoint is complete it has another name, so whatever interrupts the write leaves
     the earlier ones as they are. What the system refuses (a full disk) raises `CheckpointError`.
     """
-    folder = Path(folder).absolute()
+    # The storage library wants all hosts to call it, with one path.
+    folder = hosts.path_of_first(Path(folder).absolute())
     path = folder / str(step)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        _clean(folder)
+        if hosts.is_first():
+            folder.mkdir(parents=True, exist_ok=True)
+            _clean(folder)
         with _quiet():
-            ocp.save(str(path), _flatten(state))
+            ocp.save(str(path), jax.device_get(hosts.without_keys(_flatten(state))))
     # The storage library reports what the system refuses as ValueError.
     except (OSError, ValueError) as error:
         _clean(folder)
@@ -43,8 +48,9 @@ def save(folder: str | Path, step: int, state: Any, keep: int) -> Path:
         raise CheckpointError(
             f"{path}: cannot write the checkpoint ({kept}); free space on the disk: {reason}"
         ) from error
-    for old in _complete(folder)[:-keep]:
-        shutil.rmtree(old, ignore_errors=True)
+    if hosts.is_first():
+        for old in _complete(folder)[:-keep]:
+            shutil.rmtree(old, ignore_errors=True)
     return path
 
 
@@ -61,19 +67,19 @@ def load(path: str | Path, like: State) -> State:
     """
     path = Path(path).absolute()
     leaves = _flatten(like)
+    stored = jax.eval_shape(hosts.without_keys, leaves)
+    this = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(primary_host=this, active_processes={this})
     try:
-        with _quiet():
+        with _quiet(), ocp.Context(multiprocessing_options=alone):
             found = ocp.metadata(str(path)).metadata
-            _check(path, leaves, found)
-            sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-            abstract = {
-                name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
-                for name, leaf in leaves.items()
-            }
-            restored = ocp.load(str(path), abstract)
+            _check(path, stored, found)
+            arrays = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in stored.items()}
+            restored = jax.device_put(ocp.load(str(path), arrays))
     except (OSError, ValueError, KeyError) as error:
         reason = str(error).splitlines()[0]
         raise CheckpointError(f"{path}: not a readable checkpoint: {reason}") from error
+    restored = hosts.with_keys(leaves, restored)
     return jax.tree.unflatten(jax.tree.structure(like), [restored[name] for name in leaves])
 
 
@@ -95,11 +101,7 @@ def _check(path: Path, expected: dict[str, Any], found: dict[str, Any]) -> None:
 
 
 def _describe(leaf: Any) -> str:
-    shape, dtype = tuple(leaf.shape), leaf.dtype
-    if jnp.issubdtype(dtype, jax.dtypes.prng_key):
-        data = jax.eval_shape(jax.random.key_data, leaf)  # what is stored
-        shape, dtype = data.shape, data.dtype
-    return f"{dtype}{list(shape)}"
+    return f"{leaf.dtype}{list(leaf.shape)}"
 
 
 def _complete(folder: Path) -> list[Path]:

@@ -7,11 +7,14 @@ is shared out already, everything is computed in one place.
 import contextlib
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from vertiwm_jax import hosts
 
 T = TypeVar("T")
 
@@ -47,20 +50,40 @@ def use_cores() -> None:
 
 
 def mesh(batch: int) -> Mesh:
-    """The devices for batches of this size: as many as divide it and have `FEWEST` rows or more."""
-    most = max(1, min(jax.device_count(), batch // FEWEST))
-    even = next(number for number in range(most, 0, -1) if batch % number == 0)
-    return Mesh(np.array(jax.devices()[:even]), (AXIS,), axis_types=(AxisType.Auto,))
+    """The devices for batches of this size: as many as divide it and have `FEWEST` rows or more.
+
+    They are equally many of each host; where that cannot be, every host does all with its own.
+    """
+    most, each = max(1, batch // FEWEST), jax.local_device_count()
+    of_all = sorted(jax.devices(), key=lambda device: device.process_index)
+    together, alone = np.reshape(of_all, (-1, each)), np.reshape(jax.local_devices(), (1, each))
+    even = next(
+        by_host[:, :number]
+        for by_host in (together, alone)
+        for number in range(each, 0, -1)
+        if len(by_host) * number <= most and batch % (len(by_host) * number) == 0
+    )
+    return Mesh(even.ravel(), (AXIS,), axis_types=(AxisType.Auto,))
 
 
 def everywhere(mesh: Mesh, tree: T) -> T:
-    """A pytree of arrays, of which every device has a copy."""
-    return jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+    """A pytree of arrays, of which every device has a copy; of several hosts, the first one's."""
+    places = on_all(mesh)
+    if not mesh.is_multi_process:
+        return jax.device_put(tree, places)
+    sent = hosts.of_first(hosts.without_keys(tree))
+    placed = jax.tree.map(partial(jax.make_array_from_process_local_data, places), sent)
+    return hosts.with_keys(tree, placed)
+
+
+def on_all(mesh: Mesh) -> NamedSharding:
+    """The place of what every device has a copy of."""
+    return NamedSharding(mesh, PartitionSpec())
 
 
 def in_one_place(tree: T) -> T:
-    """A pytree of arrays that are on one device, and whose types know of no mesh any more."""
-    return jax.device_put(tree, SingleDeviceSharding(jax.devices()[0]))
+    """This host's first copies of arrays that every device has; their types know of no mesh."""
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)
 
 
 def shared_out(function: Callable[..., T], batch: int) -> Callable[..., T]:
@@ -70,7 +93,7 @@ def shared_out(function: Callable[..., T], batch: int) -> Callable[..., T]:
         over = mesh(batch)
         with jax.set_mesh(over):
             result = function(*everywhere(over, args))
-        return in_one_place(result)
+        return in_one_place(jax.device_put(result, on_all(over)))
 
     return on_mesh
 

@@ -25,7 +25,7 @@ from tensorboardX.proto.event_pb2 import (  # generated without types
 )
 from tensorboardX.summary import scalar
 
-from vertiwm_jax import config
+from vertiwm_jax import config, hosts
 
 METRICS = "metrics.jsonl"
 
@@ -95,11 +95,14 @@ class Run:
 
     @classmethod
     def begin(cls, settings: Resumable, name: str, step: int = 0) -> Self:
-        """Create a run with these settings, or continue the one that they name from `step`."""
+        """Create a run with these settings, or continue the one that they name from `step`.
+
+        Of several hosts only the first one's folder is there, others have theirs for the time.
+        """
         kept = dataclasses.replace(settings, resume=None)
         if settings.resume is None:
-            return cls.create(settings.runs, name, kept)
-        return cls.open(settings.resume, step, kept)
+            return cls.create(hosts.own(settings.runs), name, kept)
+        return cls.open(hosts.own_copy(settings.resume), step, kept)
 
     def part(self, name: str, step: int, settings: Any) -> Self:
         """A run in the folder `name` inside this one: made, or continued like `open` does."""

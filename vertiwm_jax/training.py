@@ -13,7 +13,7 @@ from typing import Any, Protocol, TypeVar
 import jax
 import numpy as np
 
-from vertiwm_jax import checkpoints, devices
+from vertiwm_jax import checkpoints, devices, hosts
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.runs import Run, RunError
 
@@ -81,6 +81,13 @@ def failures_in_one_line(*expected: type[Exception]) -> Iterator[None]:
         sys.exit(130)
     except (RunError, CheckpointError, TrainingError, *expected) as error:
         sys.exit(f"error: {error}")
+    except jax.errors.JaxRuntimeError as error:
+        if jax.process_count() == 1:
+            raise
+        sys.exit(
+            "error: another host has stopped or cannot be reached; go on from the newest "
+            f"checkpoint with --resume and the run folder: {str(error).splitlines()[0]}"
+        )
 
 
 def keep_compiled(folder: Path | None) -> None:
@@ -113,9 +120,9 @@ def train(
 ) -> State:
     """Trains until `iterations` are done, from the beginning or from what `restore` gave.
 
-    Gives the final state. Ctrl-C ends the current iteration, saves and raises
-    `TrainingInterrupted`; a second one stops at once. `TrainingError` when an iteration says that
-    it is not finite.
+    Gives the final state. Ctrl-C or SIGTERM, on any host, ends the current iteration, saves and
+    raises `TrainingInterrupted`; a second one stops at once. `TrainingError` when an iteration says
+    that it is not finite.
     """
     folder = run.folder / "checkpoints"
     if restored:
@@ -130,15 +137,14 @@ def train(
     start = time.perf_counter()
     # Between iterations every device has all, so that checkpoints do not know of devices.
     data, state = devices.everywhere(mesh, (data, state))
-    whole = jax.tree.map(lambda leaf: leaf.sharding, state)
-    iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=(whole, None))
+    iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=devices.on_all(mesh))
     with jax.set_mesh(mesh):
         iterate = iterate.lower(data, state).compile()
     print(f"compiled in {time.perf_counter() - start:.0f} s", flush=True)
 
     total = (iterations - done) * work.amount
     with _interruptible() as interrupted, run.progress(total, "training") as progress:
-        while done < iterations and not interrupted:
+        while done < iterations and not hosts.on_any(bool(interrupted)):
             start = time.perf_counter()
             state, metrics = iterate(data, state)
             metrics = jax.device_get(metrics)
@@ -181,17 +187,22 @@ def _diverged(iteration: int, checkpoint: Path | None) -> str:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[list[int]]:
-    """The first Ctrl-C is noted in the list that this gives, the second acts as always."""
+    """The first Ctrl-C or SIGTERM is noted in the list that this gives, a second acts as always."""
     seen: list[int] = []
-    before = signal.getsignal(signal.SIGINT)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def as_before() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
     def note(number: int, frame: FrameType | None) -> None:
         seen.append(number)
-        signal.signal(signal.SIGINT, before)
+        as_before()
         print("\nstopping after this iteration; Ctrl-C again stops at once", flush=True)
 
-    signal.signal(signal.SIGINT, note)
+    for number in before:
+        signal.signal(number, note)
     try:
         yield seen
     finally:
-        signal.signal(signal.SIGINT, before)
+        as_before()

@@ -1,0 +1,131 @@
+"""Several hosts that compute together: the same command on each, joined by `jax.distributed`.
+
+All of them do the same, from the same settings. Where they might come to differ, by a rounding or
+by what a user does, they agree; what is printed and kept is the first one's.
+"""
+
+import atexit
+import os
+import shutil
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+
+T = TypeVar("T")
+
+COMMANDS = ("ppo", "sac", "td3", "fit")
+"""Commands that several hosts can run together."""
+_COORDINATOR, _PROCESSES, _PROCESS = _VARIABLES = (
+    "JAX_COORDINATOR_ADDRESS",
+    "JAX_NUM_PROCESSES",
+    "JAX_PROCESS_ID",
+)
+
+_LONGEST_PATH = 4096  # bytes
+_PATIENCE = 60  # seconds that a process waits for the others at its end, whatever ended it
+
+
+def join(module: str) -> None:
+    """Makes this process, which runs `module`, one of several if the environment says so.
+
+    `JAX_COORDINATOR_ADDRESS` is HOST:PORT of the first one, `JAX_NUM_PROCESSES` how many they are
+    and `JAX_PROCESS_ID`, from 0, which this is; those that are not set are the cluster's, where it
+    is one that JAX knows (SLURM, Open MPI). Ends the process with one line where that fails.
+    """
+    if not any(name in os.environ for name in _VARIABLES):
+        return
+    if module.rpartition(".")[2] not in COMMANDS:
+        sys.exit(f"error: {module}: expected one process, found {_found()}; unset them")
+    # Its handler would swallow SIGTERM, at which a training saves and stops.
+    jax.config.update("jax_enable_preemption_service", False)
+    try:
+        jax.distributed.initialize(
+            num_processes=_number(_PROCESSES),
+            process_id=_number(_PROCESS),
+            shutdown_timeout_seconds=_PATIENCE,
+        )
+    except (ValueError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        sys.exit(f"error: {', '.join(_VARIABLES)}: cannot join, found {_found()}: {reason}")
+    each = Counter(device.process_index for device in jax.devices())
+    if len(set(each.values())) > 1:
+        sys.exit(
+            "error: expected as many devices on every host, found "
+            f"{[each[index] for index in sorted(each)]}; JAX_NUM_CPU_DEVICES sets those of a CPU"
+        )
+    if not is_first():
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+
+
+def is_first() -> bool:
+    """Whether this process is the one whose results are kept."""
+    return jax.process_index() == 0
+
+
+def on_any(flag: bool) -> bool:
+    """Whether the flag is set on any host; all have to ask."""
+    return bool(np.any(multihost_utils.process_allgather(np.array(flag))))
+
+
+def of_first(tree: T) -> T:
+    """A pytree of NumPy arrays: those of the first host, which all have to ask for."""
+    return multihost_utils.broadcast_one_to_all(tree)
+
+
+def path_of_first(path: Path) -> Path:
+    """The path that the first host gives, which all have to ask for."""
+    encoded = os.fsencode(path).ljust(_LONGEST_PATH, b"\0")
+    sent = of_first(np.frombuffer(encoded, np.uint8))
+    return Path(os.fsdecode(sent.tobytes().rstrip(b"\0")))
+
+
+def own(folder: Path) -> Path:
+    """`folder` on the first host; on others an empty one that goes when the process ends."""
+    if is_first():
+        return folder
+    scratch = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, scratch, ignore_errors=True)
+    return scratch
+
+
+def own_copy(folder: Path) -> Path:
+    """`folder` on the first host; on others a copy, made before the first one changes it."""
+    place = own(folder)
+    if place != folder:
+        shutil.copytree(folder, place, dirs_exist_ok=True)
+    multihost_utils.sync_global_devices("copied")
+    return place
+
+
+def without_keys(tree: Any) -> Any:
+    """A pytree with the data of random keys in their place, as NumPy and files know them."""
+    return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, tree)
+
+
+def with_keys(like: T, tree: Any) -> T:
+    """The inverse: random keys where `like` has some."""
+    return jax.tree.map(lambda x, y: jax.random.wrap_key_data(y) if _is_key(x) else y, like, tree)
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(jnp.result_type(leaf), jax.dtypes.prng_key)
+
+
+def _number(name: str) -> int | None:
+    text = os.environ.get(name)
+    if text is None:
+        return None
+    if not text.isdecimal():
+        sys.exit(f"error: {name}: expected a whole number, found {text!r}")
+    return int(text)
+
+
+def _found() -> str:
+    return ", ".join(f"{name}={os.environ[name]}" for name in _VARIABLES if name in os.environ)
