@@ -4,13 +4,14 @@ import contextlib
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax import checkpoints, devices, hosts
@@ -88,6 +89,22 @@ def failures_in_one_line(*expected: type[Exception]) -> Iterator[None]:
             "error: another host has stopped or cannot be reached; go on from the newest "
             f"checkpoint with --resume and the run folder: {str(error).splitlines()[0]}"
         )
+
+
+def mean_in_turns(function: Callable[[Any], State], batches: Any) -> State:
+    """Mean of what the function gives for each of several batches, with one at a time in memory.
+
+    batches: pytree with leaves `[K, ...]`. Of gradients this is what gives that of all K together.
+    """
+    number = len(jax.tree.leaves(batches)[0])
+    first = jax.tree.map(lambda x: x[0], batches)
+    if number == 1:
+        return function(first)
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function, first))
+    total, _ = jax.lax.scan(
+        lambda total, batch: (jax.tree.map(jnp.add, total, function(batch)), None), nothing, batches
+    )
+    return jax.tree.map(lambda x: x / number, total)
 
 
 def keep_compiled(folder: Path | None) -> None:

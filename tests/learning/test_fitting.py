@@ -35,14 +35,16 @@ class Line:
 
     def loss(self, params, data, key):
         rows = jax.random.randint(key, (self.batch,), 0, len(data))
-        x = data[rows]
-        error = x @ params["slope"] + params["offset"] - x @ SLOPE
         spoilt = jax.random.uniform(jax.random.fold_in(key, 1)) < self.lost
-        return jnp.mean(error**2) * jnp.where(spoilt, jnp.nan, 1.0)
+        return squared_error(params, data[rows]) * jnp.where(spoilt, jnp.nan, 1.0)
 
     def validate(self, params, data):
         error = jnp.mean((data @ (params["slope"] - SLOPE) + params["offset"]) ** 2)
         return {"error": error, "never": jnp.nan}
+
+
+def squared_error(params, x):
+    return jnp.mean((x @ params["slope"] + params["offset"] - x @ SLOPE) ** 2)
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,9 @@ def test_a_fit_that_was_stopped_ends_with_the_same_bits(new_run, monkeypatch):
     assert numbers(stopped_run) == numbers(straight_run)
 
 
-def test_updates_are_those_of_adamw_by_hand():
-    fit = Fit(Line(), CONFIG)
+@pytest.mark.parametrize("batches", [1, 3])
+def test_updates_are_those_of_adamw_by_hand(batches):
+    fit = Fit(Line(), replace(CONFIG, accumulate=batches))
     inputs, key = FitInputs(params(), data()), jax.random.key(0)
     state, _ = jax.jit(fit.iterate)(inputs, fit.init(inputs, key))
     rate = optax.warmup_cosine_decay_schedule(0.0, 0.1, 5, 60, 0.001)
@@ -120,7 +123,9 @@ def test_updates_are_those_of_adamw_by_hand():
     weights = {name: np.float64(p) for name, p in params().items()}
     for step in range(10):
         now = jax.tree.map(jnp.float32, weights)
-        gradient = jax.grad(Line().loss)(now, data(), jax.random.fold_in(key, step))
+        keys = [jax.random.fold_in(key, batches * step + batch) for batch in range(batches)]
+        rows = [jax.random.randint(key, (Line().batch,), 0, len(data())) for key in keys]
+        gradient = jax.grad(squared_error)(now, data()[jnp.concatenate(rows)])
         norm = np.sqrt(sum(np.sum(np.float64(g) ** 2) for g in gradient.values()))
         for name, g in gradient.items():
             g = np.float64(g) * min(1, 1 / norm)
@@ -195,6 +200,7 @@ def test_entries_that_do_not_exist_cannot_be_trained(new_run):
     [
         ({"updates": 0}, "updates: expected at least 1, found 0"),
         ({"updates": 65}, "updates: expected a multiple of updates_per_iteration, 10, found 65"),
+        ({"accumulate": 0}, "accumulate: expected at least 1, found 0"),
         ({"warm_up": 60}, "warm_up: expected 0 to 59 updates, found 60"),
         ({"learning_rate": 0.0}, "learning_rate: expected more than 0"),
         ({"max_gradient_norm": 0.0}, "max_gradient_norm: expected more than 0"),

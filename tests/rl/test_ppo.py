@@ -137,6 +137,23 @@ def test_minibatches_must_divide_the_batch():
         PPOConfig(num_envs=4, num_steps=4, minibatches=7)
 
 
+def test_a_minibatch_in_parts_gives_the_gradient_of_the_whole():
+    def learned(parts):
+        config = PPOConfig(**{**vars(CONFIG), "accumulate": parts, "value_clip": 0.1})
+        state, metrics = train(PPO(Target(), config), iterations=2)
+        return state.params, metrics
+
+    chex.assert_trees_all_close(learned(4), learned(1), rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("parts", [0, 3, 256])
+def test_parts_must_divide_the_minibatch(parts):
+    with pytest.raises(
+        ValueError, match=f"accumulate: expected a divisor of .* 128, found {parts}"
+    ):
+        PPOConfig(**{**vars(CONFIG), "accumulate": parts})
+
+
 def test_entropy_weight_widens_the_policy():
     ppo = PPO(Constant(), PPOConfig(**{**vars(CONFIG), "entropy_weight": 0.1}))
     first, last = (train(ppo, iterations=n)[1]["entropy"] for n in (1, 10))

@@ -50,9 +50,11 @@ class FitConfig:
     """How parameters are fitted."""
 
     updates: int = 10_000
-    """Optimiser steps (AdamW), each on a batch of its own."""
+    """Optimiser steps (AdamW), each on a batch, or batches, of its own."""
     updates_per_iteration: int = 100
     """Updates between two validations, in one compiled call."""
+    accumulate: int = 1
+    """Batches whose gradients make one update: a larger batch in the memory of one."""
     learning_rate: float = 1e-3
     """The highest; it rises linearly to it and falls as a cosine."""
     warm_up: int = 200
@@ -67,7 +69,7 @@ class FitConfig:
     """What is kept of the training."""
 
     def __post_init__(self):
-        for name in ("updates", "updates_per_iteration"):
+        for name in ("updates", "updates_per_iteration", "accumulate"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
         if self.updates % self.updates_per_iteration:
@@ -153,11 +155,15 @@ class Fit:
         return state, {**means, **validated, **best_error}
 
     def _update(self, inputs: FitInputs, state: FitState) -> tuple[FitState, dict[str, jax.Array]]:
-        def loss(trained: Params) -> jax.Array:
-            key = jax.random.fold_in(state.key, state.update)
+        def loss(trained: Params, batch: jax.Array) -> jax.Array:
+            key = jax.random.fold_in(state.key, batch)
             return self.problem.loss(merge(inputs.params, trained), inputs.data, key)
 
-        value, gradient = jax.value_and_grad(loss)(state.trained)
+        several = self.config.accumulate
+        value, gradient = training.mean_in_turns(
+            partial(jax.value_and_grad(loss), state.trained),
+            state.update * several + jnp.arange(several),
+        )
         norm = optax.tree.norm(gradient)
         updates, optimiser = self._optimiser.update(gradient, state.optimiser, state.trained)
         metrics = {

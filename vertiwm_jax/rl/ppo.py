@@ -6,7 +6,7 @@ object with two pure functions, `init` and `iterate`, over one `TrainState`; sev
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
 import jax
@@ -23,6 +23,7 @@ from vertiwm_jax.rl.environments import Environments, Experience, Metrics, Outco
 from vertiwm_jax.rl.learned import MeanAction, Value
 from vertiwm_jax.rl.normalise import RunningStatistics
 from vertiwm_jax.rl.settings import LearningConfig
+from vertiwm_jax.training import mean_in_turns
 
 Params = Any
 
@@ -37,6 +38,8 @@ class PPOConfig(LearningConfig):
     """Passes over the data of an iteration."""
     minibatches: int = 8
     """Gradient steps in a pass; divides num_envs * num_steps."""
+    accumulate: int = 1
+    """Parts of a minibatch whose gradients are computed one after the other, for less memory."""
     trace: float = 0.95
     """Lambda of the generalised advantage estimator."""
     clip: float = 0.2
@@ -59,9 +62,20 @@ class PPOConfig(LearningConfig):
                 f"{self.collected}; choose a divisor, for example {divisor}"
             )
 
+        if self.accumulate < 1 or self.minibatch % self.accumulate:
+            raise ValueError(
+                f"accumulate: expected a divisor of num_envs * num_steps / minibatches = "
+                f"{self.minibatch}, found {self.accumulate}"
+            )
+
+    @property
+    def minibatch(self) -> int:
+        """Transitions of one gradient step."""
+        return self.collected // self.minibatches
+
     @property
     def shareable(self) -> int:
-        return math.gcd(self.num_envs, self.collected // self.minibatches)
+        return math.gcd(self.num_envs, self.minibatch // self.accumulate)
 
     @property
     def learning_rate_schedule(self) -> optax.Schedule:
@@ -110,7 +124,10 @@ class Transitions:
 
 @struct.dataclass
 class Batch:
-    """What the loss is made of, `[B]`; `observation` is normalised, `target` a lambda return."""
+    """What the loss is made of, `[B]`; `observation` is normalised, `target` a lambda return.
+
+    advantage: in the loss, normalised over its minibatch.
+    """
 
     observation: jax.Array
     action: jax.Array
@@ -280,11 +297,8 @@ class PPO:
             policy = cast(Gaussian, actor.apply(params["actor"], batch.observation))
             log_ratio = policy.log_prob(batch.action) - batch.log_prob
             ratio = jnp.exp(log_ratio)
-            advantage = (batch.advantage - jnp.mean(batch.advantage)) / (
-                jnp.std(batch.advantage) + 1e-8
-            )
             clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
-            policy_loss = -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
+            policy_loss = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
 
             value = self._value(params, batch.observation)
             error = (value - batch.target) ** 2
@@ -306,8 +320,16 @@ class PPO:
 
         def descend(carry: tuple[Params, optax.OptState], rows: jax.Array):
             params, optimiser_state = carry
-            minibatch = devices.share(jax.tree.map(lambda x: x[rows], batch))
-            gradients, losses = jax.grad(loss, has_aux=True)(params, minibatch)
+            advantage = devices.share(batch.advantage[rows])
+            mean, deviation = jnp.mean(advantage), jnp.std(advantage)
+
+            def of_part(rows: jax.Array) -> tuple[Params, Metrics]:
+                part = devices.share(jax.tree.map(lambda x: x[rows], batch))
+                part = replace(part, advantage=(part.advantage - mean) / (deviation + 1e-8))
+                return jax.grad(loss, has_aux=True)(params, part)
+
+            parts = rows.reshape(config.accumulate, -1)
+            gradients, losses = mean_in_turns(of_part, parts)
             updates, optimiser_state = optimiser.update(gradients, optimiser_state, params)
             return (optax.apply_updates(params, updates), optimiser_state), losses
 
