@@ -13,16 +13,24 @@ import jax
 import pytest
 import trainee
 
-from vertiwm_jax import checkpoints, runs
+from vertiwm_jax import checkpoints, ppo, runs
 
 ITERATIONS = trainee.STOPPED + 3
 TESTS = Path(__file__).parent
 # To import the trainee starts JAX.
-PROGRAM = "from vertiwm_jax import hosts; hosts.join('ppo'); import trainee; trainee.main()"
+TRAINEE = "-c", "from vertiwm_jax import hosts; hosts.join('ppo'); import trainee; trainee.main()"
+TINY = """
+ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 16}
+navigation: {horizon_seconds: 3, settle_steps: 2}
+simulator: {substeps: 1}
+action_repeat: 2
+planning: null
+ppo: {transitions: 256, num_envs: 16, num_steps: 8, minibatches: 2, epochs: 1, hidden: [8]}
+"""
 
 
 def together(*argv: object) -> list[tuple[int, str, str]]:
-    """Status, output and errors of the processes of two hosts that run the trainee."""
+    """Status, output and errors of the processes of two hosts, given what Python is to run."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
@@ -34,7 +42,7 @@ def together(*argv: object) -> list[tuple[int, str, str]]:
     }
     processes = [
         subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, *map(str, argv)],
+            [sys.executable, *map(str, argv)],
             env={**os.environ, **shared, "JAX_PROCESS_ID": str(process)},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -50,12 +58,16 @@ def together(*argv: object) -> list[tuple[int, str, str]]:
     return [(process.returncode, *end) for process, end in zip(processes, ends, strict=True)]
 
 
+def numbers(run):
+    """Metrics of all iterations."""
+    timed = ("wall_time", "transitions_per_second")
+    lines = runs.read_metrics(run)
+    return [{name: line[name] for name in line if name not in timed} for line in lines]
+
+
 def learned(run):
     """Metrics of all iterations, and weights at the end."""
-    timed = ("wall_time", "transitions_per_second")
-    lines = [
-        {name: line[name] for name in line if name not in timed} for line in runs.read_metrics(run)
-    ]
+    lines = numbers(run)
     algorithm, data = trainee.PPO(trainee.Target(), trainee.CONFIG), trainee.ProbeParams()
     restored = trainee.restore(algorithm, data, run, 1)
     assert restored is not None and restored[0] == len(lines) == ITERATIONS
@@ -70,7 +82,7 @@ def expected(tmp_path_factory):
 
 
 def test_what_one_host_is_told_to_stop_all_have_saved_and_one_process_goes_on(tmp_path, expected):
-    first, other = together(tmp_path, 1000, int(signal.SIGTERM))
+    first, other = together(*TRAINEE, tmp_path, 1000, int(signal.SIGTERM))
     assert first[0] == other[0] == 130, first[2] + other[2]
     assert "compiling for 2 of 2 devices ..." in first[1]
     assert f"stopped after iteration {trainee.STOPPED} of 1000, all saved" in first[1]
@@ -84,15 +96,30 @@ def test_what_one_host_is_told_to_stop_all_have_saved_and_one_process_goes_on(tm
 
 @pytest.mark.slow
 def test_where_one_host_is_lost_others_end_and_two_go_on_from_the_checkpoint(tmp_path, expected):
-    first, other = together(tmp_path, 1000, int(signal.SIGKILL))
+    first, other = together(*TRAINEE, tmp_path, 1000, int(signal.SIGKILL))
     assert other[0] == -signal.SIGKILL
     assert first[0] == 1 and "error: another host has stopped" in first[2], first[2]
     [run] = tmp_path.iterdir()
     latest = checkpoints.latest(run / "checkpoints")
     assert latest is not None and latest.name == str(trainee.STOPPED - 1)
-    first, other = together(run, ITERATIONS)
+    first, other = together(*TRAINEE, run, ITERATIONS)
     assert first[0] == other[0] == 0, first[2] + other[2]
     chex.assert_trees_all_close(learned(run), expected, rtol=2e-4, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_a_command_on_two_hosts_leaves_one_run_that_is_the_one_of_one_process(tmp_path):
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    argv = "--config", str(tmp_path / "tiny.yaml"), "--runs"
+    first, other = together("-m", "vertiwm_jax.ppo", *argv, tmp_path / "two")
+    assert first[0] == other[0] == 0, first[2] + other[2]
+    assert "all of it is in" in first[1] and "all of it" not in other[1]
+    ppo.main([*argv, str(tmp_path / "one")])
+    [two], [one] = (list((tmp_path / name).iterdir()) for name in ("two", "one"))
+    assert len(numbers(two)) == 2
+    chex.assert_trees_all_close(numbers(two), numbers(one), rtol=2e-4, atol=2e-5)
+    files = [{path.name.partition(".tf")[0] for path in run.iterdir()} for run in (two, one)]
+    assert files[0] == files[1] and "summary.md" in files[0]
 
 
 @pytest.mark.parametrize(

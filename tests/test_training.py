@@ -35,15 +35,15 @@ def go(run, iterations, start=1.0):
     )
 
 
-def interrupt_at(monkeypatch, iteration, times):
-    """Ctrl-C, once or more, while the metrics of `iteration` are written."""
+def interrupt_at(monkeypatch, iteration, times, number=signal.SIGINT):
+    """Ctrl-C, or another signal, once or more, while the metrics of `iteration` are written."""
     log = Run.log
 
     def stopping(self, step, metrics):
         log(self, step, metrics)
         if step == iteration:
             for _ in range(times):
-                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), number)
 
     monkeypatch.setattr(Run, "log", stopping)
 
@@ -66,13 +66,15 @@ def test_metrics_checkpoints_progress_and_the_finished_state(new_run, capsys):
     assert len(runs.read_metrics(run.folder)) == 10
 
 
-def test_the_first_interrupt_ends_the_iteration_and_saves(new_run, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_interrupt_ends_the_iteration_and_saves(new_run, monkeypatch, number):
+    before = signal.getsignal(number)
     run = new_run()
     with monkeypatch.context() as patch:
-        interrupt_at(patch, 6, times=1)
+        interrupt_at(patch, 6, times=1, number=number)
         with pytest.raises(TrainingInterrupted, match=r"iteration 6 of 10, all saved; .*--resume"):
             go(run, 10)
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(number) is before
     chex.assert_trees_all_equal(go(Run.open(run.folder, 6, CONFIG), 10), Counter(jnp.float32(11)))
     assert [line["step"] for line in runs.read_metrics(run.folder)] == list(range(1, 11))
 

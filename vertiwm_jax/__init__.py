@@ -11,4 +11,4 @@ __version__ = "0.1.0"
 # JAX.
 if sys.argv[:1] == ["-m"]:
     devices.use_cores()
-    hosts.join(next((word for word in sys.orig_argv if __name__ in word), __name__))
+    hosts.join(hosts.command())

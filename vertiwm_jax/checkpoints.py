@@ -30,12 +30,13 @@ def save(folder: str | Path, step: int, state: Any, keep: int) -> Path:
     Until a checkpoint is complete it has another name, so whatever interrupts the write leaves
     the earlier ones as they are. What the system refuses (a full disk) raises `CheckpointError`.
     """
+    own = Path(folder).absolute()
     # The storage library wants all hosts to call it, with one path.
-    folder = hosts.path_of_first(Path(folder).absolute())
+    folder = hosts.path_of_first(own)
     path = folder / str(step)
     try:
+        own.mkdir(parents=True, exist_ok=True)
         if hosts.is_first():
-            folder.mkdir(parents=True, exist_ok=True)
             _clean(folder)
         with _quiet():
             ocp.save(str(path), jax.device_get(hosts.without_keys(_flatten(state))))

@@ -11,7 +11,7 @@ import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,18 +22,22 @@ T = TypeVar("T")
 
 COMMANDS = ("ppo", "sac", "td3", "fit")
 """Commands that several hosts can run together."""
-_COORDINATOR, _PROCESSES, _PROCESS = _VARIABLES = (
-    "JAX_COORDINATOR_ADDRESS",
-    "JAX_NUM_PROCESSES",
-    "JAX_PROCESS_ID",
-)
-
+_PROCESSES, _PROCESS = "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
+_VARIABLES = ("JAX_COORDINATOR_ADDRESS", _PROCESSES, _PROCESS)
 _LONGEST_PATH = 4096  # bytes
 _PATIENCE = 60  # seconds that a process waits for the others at its end, whatever ended it
 
 
-def join(module: str) -> None:
-    """Makes this process, which runs `module`, one of several if the environment says so.
+def command() -> str:
+    """NAME where `python -m vertiwm_jax.NAME` is what runs, or else nothing."""
+    words = (word.removeprefix("-m") for word in sys.orig_argv)
+    return next((word for word in words if word.startswith(f"{__package__}.")), "").partition(".")[
+        2
+    ]
+
+
+def join(command: str) -> None:
+    """Makes this process, which runs a command, one of several if the environment says so.
 
     `JAX_COORDINATOR_ADDRESS` is HOST:PORT of the first one, `JAX_NUM_PROCESSES` how many they are
     and `JAX_PROCESS_ID`, from 0, which this is; those that are not set are the cluster's, where it
@@ -41,8 +45,11 @@ def join(module: str) -> None:
     """
     if not any(name in os.environ for name in _VARIABLES):
         return
-    if module.rpartition(".")[2] not in COMMANDS:
-        sys.exit(f"error: {module}: expected one process, found {_found()}; unset them")
+    if command not in COMMANDS:
+        sys.exit(
+            f"error: {command}: expected one process, found {_found()}; unset them, only "
+            f"{', '.join(COMMANDS)} run on several hosts"
+        )
     # Its handler would swallow SIGTERM, at which a training saves and stops.
     jax.config.update("jax_enable_preemption_service", False)
     try:
@@ -87,7 +94,7 @@ def path_of_first(path: Path) -> Path:
 
 
 def own(folder: Path) -> Path:
-    """`folder` on the first host; on others an empty one that goes when the process ends."""
+    """`folder` on the first host; on others an empty one that goes at a process's regular end."""
     if is_first():
         return folder
     scratch = Path(tempfile.mkdtemp())
@@ -102,6 +109,17 @@ def own_copy(folder: Path) -> Path:
         shutil.copytree(folder, place, dirs_exist_ok=True)
     multihost_utils.sync_global_devices("copied")
     return place
+
+
+def leave(status: int | str) -> NoReturn:
+    """Ends this process like `sys.exit`, but at once where others wait for it: so they learn it."""
+    if jax.process_count() == 1:
+        sys.exit(status)
+    if isinstance(status, str):
+        print(status, file=sys.stderr)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(1 if isinstance(status, str) else status)  # Else JAX would wait for the others here.
 
 
 def without_keys(tree: Any) -> Any:

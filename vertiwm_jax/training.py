@@ -1,6 +1,7 @@
 """The host loop of training: progress, metrics and checkpoints around a compiled algorithm."""
 
 import contextlib
+import re
 import signal
 import sys
 import time
@@ -79,13 +80,14 @@ def failures_in_one_line(*expected: type[Exception]) -> Iterator[None]:
         sys.exit(130)
     except KeyboardInterrupt:
         print("stopped at once; go on from the newest checkpoint with --resume and the run folder")
-        sys.exit(130)
+        hosts.leave(130)
     except (RunError, CheckpointError, TrainingError, *expected) as error:
-        sys.exit(f"error: {error}")
-    except jax.errors.JaxRuntimeError as error:
-        if jax.process_count() == 1:
+        hosts.leave(f"error: {error}")
+    except (jax.errors.JaxRuntimeError, ValueError) as error:
+        # XLA raises either, beginning with a status like "UNKNOWN: ", where a connection breaks.
+        if jax.process_count() == 1 or not re.match("[A-Z_]+: ", str(error)):
             raise
-        sys.exit(
+        hosts.leave(
             "error: another host has stopped or cannot be reached; go on from the newest "
             f"checkpoint with --resume and the run folder: {str(error).splitlines()[0]}"
         )
