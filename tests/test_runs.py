@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from tensorboardX.proto.event_pb2 import Event
 
-from vertiwm_jax import config, runs
+from vertiwm_jax import config, runs, tracking
 from vertiwm_jax.runs import Progress, Run, RunError, new_folder, read_metrics, write_atomic
+from vertiwm_jax.tracking import TrackingError
 
 
 @dataclass(frozen=True)
@@ -228,3 +229,37 @@ def test_metrics_are_standard_json_lines(tmp_path):
         run.log(1, {"return": 1})
     (line,) = (run.folder / runs.METRICS).read_text().splitlines()
     assert set(json.loads(line)) == {"step", "wall_time", "return"}
+
+
+@dataclass(frozen=True)
+class Tracked(Settings):
+    runs: Path = Path("runs")
+    resume: Path | None = None
+
+
+def kept_offline(folder: Path) -> bytes:
+    """What Weights & Biases keeps in a folder until it has a network: records, not compressed."""
+    (file,) = folder.glob("wandb/offline-run-*/*.wandb")
+    return file.read_bytes()
+
+
+def test_metrics_also_go_to_a_named_project_of_weights_and_biases(tmp_path, monkeypatch):
+    pytest.importorskip("wandb", reason="needs the extra `test`")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    with Run.begin(Tracked(runs=tmp_path), "ppo", project="driving") as run:
+        run.log(10, {"episode_return": 1234.5})
+        with run.part("gate", 0, Settings()) as part:
+            part.log(1, {"gate_loss": 0.015625})
+    whole, of_part = kept_offline(run.folder), kept_offline(part.folder)
+    assert b"driving" in whole and b"driving" in of_part
+    assert b"episode_return" in whole and b"1234.5" in whole and b"gate_loss" not in whole
+    assert b"gate_loss" in of_part and b"0.015625" in of_part
+    assert read_metrics(run.folder)[0]["episode_return"] == 1234.5
+
+
+def test_a_project_without_the_package_is_said_before_a_folder_is_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(tracking, "find_spec", lambda name: None)
+    message = "wandb: expected the package for project 'driving', found none; pip install wandb"
+    with pytest.raises(TrackingError, match=message):
+        Run.begin(Tracked(runs=tmp_path), "ppo", project="driving")
+    assert not list(tmp_path.iterdir())

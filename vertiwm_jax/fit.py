@@ -47,6 +47,8 @@ class FitConfig(PipelineConfig):
     start: Path | None = None
     """Folder of a fitted model to go on from, or `pretrained`: it is fitted further by open-loop
     predictions; its encoders and constants stay."""
+    wandb: str | None = None
+    """Project of Weights & Biases that gets the metrics too; needs the package `wandb`."""
     compile_cache: Path | None = None
     """Folder that keeps compiled programs for later runs."""
 
@@ -57,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     keep_compiled(config.compile_cache)
     with failures_in_one_line(ValueError):
         start = _start(config)
-        with Run.begin(config, config.name) as run:
+        with Run.begin(config, config.name, project=config.wandb) as run:
             print(f"run folder {run.folder}", flush=True)
             key = jax.random.key(config.seed)
             folders = config.data + config.add

@@ -64,6 +64,8 @@ class TrainConfig(TaskConfig, ABC):
     """Folder in which the folder of this run is made."""
     resume: Path | None = None
     """Folder of an earlier run to go on with; what is set beside changes its configuration."""
+    wandb: str | None = None
+    """Project of Weights & Biases that gets the metrics too; needs the package `wandb`."""
     compile_cache: Path | None = None
     """Folder that keeps compiled programs for later runs."""
     action_repeat: int = 4
@@ -152,7 +154,7 @@ def train_and_report(config: TrainConfig) -> Path:
     algorithm, schedule, seeds = config.algorithm(env), config.schedule, config.loop.seeds
     steps = schedule.collected * config.action_repeat
     restored = restore(algorithm, params, config.resume, seeds) if config.resume else None
-    with Run.begin(config, config.name, restored[0] if restored else 0) as run:
+    with Run.begin(config, config.name, restored[0] if restored else 0, config.wandb) as run:
         print(f"run folder {run.folder}", flush=True)
         print(f"training in {config.model} on {params.terrain.worlds} worlds", flush=True)
         key = config.key("training")

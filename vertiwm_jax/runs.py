@@ -25,7 +25,7 @@ from tensorboardX.proto.event_pb2 import (  # generated without types
 )
 from tensorboardX.summary import scalar
 
-from vertiwm_jax import config, hosts
+from vertiwm_jax import config, hosts, tracking
 
 METRICS = "metrics.jsonl"
 
@@ -60,6 +60,8 @@ class Run:
         self.folder = folder
         self.outermost = folder
         self._events = events
+        self._project: str | None = None
+        self._tracker: Any = None
 
     @classmethod
     def create(cls, root: str | Path, name: str, settings: Any) -> Self:
@@ -94,15 +96,23 @@ class Run:
         return cls(folder, events)
 
     @classmethod
-    def begin(cls, settings: Resumable, name: str, step: int = 0) -> Self:
+    def begin(
+        cls, settings: Resumable, name: str, step: int = 0, project: str | None = None
+    ) -> Self:
         """Create a run with these settings, or continue the one that they name from `step`.
 
         Of several hosts only the first one's folder is there, others have theirs for the time.
+        project: of Weights & Biases, which gets the metrics too; may raise `TrackingError`.
         """
         kept = dataclasses.replace(settings, resume=None)
+        if project:
+            tracking.check(project)
         if settings.resume is None:
-            return cls.create(hosts.own(settings.runs), name, kept)
-        return cls.open(hosts.own_copy(settings.resume), step, kept)
+            run = cls.create(hosts.own(settings.runs), name, kept)
+        else:
+            run = cls.open(hosts.own_copy(settings.resume), step, kept)
+        run._track(project, kept)
+        return run
 
     def part(self, name: str, step: int, settings: Any) -> Self:
         """A run in the folder `name` inside this one: made, or continued like `open` does."""
@@ -116,7 +126,13 @@ class Run:
         except OSError as error:
             raise RunError(f"{folder}: cannot start a run there: {error}") from error
         part.outermost = self.outermost
+        part._track(self._project, settings)
         return part
+
+    def _track(self, project: str | None, settings: Any) -> None:
+        self._project = project
+        if project and hosts.is_first():
+            self._tracker = tracking.begin(project, self.folder, self.outermost, settings)
 
     @classmethod
     def _begin(cls, folder: Path, settings: Any) -> Self:
@@ -141,9 +157,13 @@ class Run:
             self._events.flush()
         except OSError as error:
             raise RunError(f"{self.folder}: cannot write TensorBoard events: {error}") from error
+        if self._tracker:
+            self._tracker.log(values, step=int(step))
 
     def close(self) -> None:
         """Close the TensorBoard file; `metrics.jsonl` is always complete."""
+        if self._tracker:
+            self._tracker.finish()
         try:
             self._events.close()
         except OSError as error:

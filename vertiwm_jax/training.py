@@ -18,6 +18,7 @@ import numpy as np
 from vertiwm_jax import checkpoints, devices, hosts
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.runs import Run, RunError
+from vertiwm_jax.tracking import TrackingError
 
 State = TypeVar("State")
 
@@ -81,7 +82,7 @@ def failures_in_one_line(*expected: type[Exception]) -> Iterator[None]:
     except KeyboardInterrupt:
         print("stopped at once; go on from the newest checkpoint with --resume and the run folder")
         hosts.leave(130)
-    except (RunError, CheckpointError, TrainingError, *expected) as error:
+    except (RunError, CheckpointError, TrackingError, TrainingError, *expected) as error:
         hosts.leave(f"error: {error}")
     except (jax.errors.JaxRuntimeError, ValueError) as error:
         # XLA raises either, beginning with a status like "UNKNOWN: ", where a connection breaks.
