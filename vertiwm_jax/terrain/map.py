@@ -11,6 +11,7 @@ from flax import struct
 from numpy.typing import ArrayLike
 
 from vertiwm_jax.terrain import soil
+from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.soil import Soil
 
@@ -55,6 +56,7 @@ class TerrainMap:
     world: `[]` int32, the selected world.
     class_names: K names, static.
     grip: `[]` what all friction is multiplied by; None for 1.
+    belief: what is known of the selected world, which is all that queries tell; None for all of it.
     """
 
     elevation: jax.Array
@@ -70,6 +72,7 @@ class TerrainMap:
     world: jax.Array
     class_names: tuple[str, ...] = struct.field(pytree_node=False)
     grip: jax.Array | None = None
+    belief: MapBelief | None = None
 
     @property
     def worlds(self) -> int:

@@ -1,8 +1,9 @@
-"""Obstacles: axis-aligned boxes that stand on the ground."""
+"""Obstacles: axis-aligned boxes that stand on the ground; those whose middle is known."""
 
 import jax
 import jax.numpy as jnp
 
+from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 
 
@@ -30,7 +31,7 @@ def gap(
 def _gaps(
     terrain: TerrainMap, xy: jax.Array, yaw: jax.Array, length: float, width: float
 ) -> jax.Array:
-    """`[..., N]` m to each obstacle, inf to rows not in use.
+    """`[..., N]` m to each obstacle, inf to rows not in use and to obstacles that are not known.
 
     Separating-axis test on the two axes of the map and the two of the body.
     """
@@ -49,4 +50,7 @@ def _gaps(
         jnp.abs(cos * x + sin * y) - (length / 2 + c * wide + s * tall),
         jnp.abs(cos * y - sin * x) - (width / 2 + s * wide + c * tall),
     )
-    return jnp.where(obstacles[:, 4] > 0, jnp.maximum(on_map, on_body), jnp.inf)
+    there = obstacles[:, 4] > 0
+    if terrain.belief is not None:
+        there &= query.known(terrain, obstacles[:, :2])
+    return jnp.where(there, jnp.maximum(on_map, on_body), jnp.inf)

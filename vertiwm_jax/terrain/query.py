@@ -2,7 +2,8 @@
 
 Every gather is a flat index into the stacked worlds, clipped first and then promised in bounds,
 so that a batch of vehicles on different worlds is one gather and copies no map. Outside the map
-the ground continues level from its edge; a NaN coordinate reads the first row or column.
+the ground continues level from its edge; a NaN coordinate reads the first row or column. Where
+a map has a belief, what it does not know is answered by what it guesses.
 """
 
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax.state import CELL_PIXELS, STEP_SECONDS, Patches
+from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.map import TerrainMap
 
 PATCH_PIXELS = 128
@@ -91,7 +93,7 @@ def patches(
     else:
         elevation = (heights - position[2]) / RELIEF_METRES
     palette = jnp.clip(terrain.class_rgb.astype(jnp.float32) / 127.5 - 1, -1, 1)
-    semantic = _gather(terrain.semantic, _cell_index(terrain, row, column)).astype(jnp.int32)
+    semantic = _classes(terrain, row, column, _cell_index(terrain, row, column))
     rgb = [_image(_gather(colours, semantic)) for colours in palette.T]
     return Patches(_image(jnp.clip(elevation, -1, 1)), jnp.stack(rgb, axis=-1))
 
@@ -105,7 +107,7 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
     """
     column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
     cell = _cell_index(terrain, row, column)
-    semantic = _gather(terrain.semantic, cell).astype(jnp.int32)
+    semantic = _classes(terrain, row, column, cell)
     soft = _gather(terrain.deformable, semantic)
     bottom_left, along, up, twist, fx, fy = _corners(terrain, row, column)
     rising = fx > fy
@@ -123,6 +125,9 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
     friction = _gather(terrain.friction, cell)
     if terrain.grip is not None:
         friction = terrain.grip * friction
+    if terrain.belief is not None:
+        known = _known(terrain, terrain.belief, row, column)
+        friction = jnp.where(known, friction, terrain.belief.friction)
     return Surface(height, gradient, semantic, friction)
 
 
@@ -130,6 +135,14 @@ def height(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     """`[..., 2]` p_world to `[...]` bilinear height, m, whatever the class."""
     column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
     return _bilinear(terrain, row, column)
+
+
+def known(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
+    """Whether the map is known at points `[..., 2]` p_world, m: `[...]` bool."""
+    if terrain.belief is None:
+        return jnp.ones(xy.shape[:-1], bool)
+    column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
+    return _known(terrain, terrain.belief, row, column)
 
 
 def normal(gradient: jax.Array) -> jax.Array:
@@ -215,11 +228,49 @@ def _gather(table: jax.Array, index: jax.Array) -> jax.Array:
 
 def _cell_index(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Array:
     """The class cell that contains fractional vertex coordinates on the map."""
-    _, rows, columns = terrain.elevation.shape
     _, cell_rows, cell_columns = terrain.semantic.shape
+    i, j = _cell(terrain, cell_rows, cell_columns, row, column)
+    return _flat_index(terrain, cell_rows, cell_columns, i, j)
+
+
+def _cell(
+    terrain: TerrainMap, cell_rows: int, cell_columns: int, row: jax.Array, column: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Which of the cells that tile the map contains fractional vertex coordinates on it."""
+    _, rows, columns = terrain.elevation.shape
     i = jnp.minimum((row * (cell_rows / (rows - 1))).astype(jnp.int32), cell_rows - 1)
     j = jnp.minimum((column * (cell_columns / (columns - 1))).astype(jnp.int32), cell_columns - 1)
-    return _flat_index(terrain, cell_rows, cell_columns, i, j)
+    return i, j
+
+
+def _known(terrain: TerrainMap, belief: MapBelief, row: jax.Array, column: jax.Array) -> jax.Array:
+    """Whether the belief knows the map at fractional vertex coordinates on it."""
+    cell_rows, cell_columns = belief.known.shape
+    i, j = _cell(terrain, cell_rows, cell_columns, row, column)
+    return _gather(belief.known, i * cell_columns + j)
+
+
+def _classes(terrain: TerrainMap, row: jax.Array, column: jax.Array, cell: jax.Array) -> jax.Array:
+    """int32 class ids at fractional vertex coordinates on the map, which lie in the cells."""
+    semantic = _gather(terrain.semantic, cell).astype(jnp.int32)
+    belief = terrain.belief
+    if belief is None:
+        return semantic
+    return jnp.where(_known(terrain, belief, row, column), semantic, belief.semantic)
+
+
+def _vertices(
+    terrain: TerrainMap, row: jax.Array, column: jax.Array, index: jax.Array
+) -> jax.Array:
+    """Heights of the vertices in the rows and columns, at the index, m."""
+    heights = _gather(terrain.elevation, index)
+    belief = terrain.belief
+    if belief is None:
+        return heights
+    x = terrain.origin[0] + column * terrain.resolution
+    y = terrain.origin[1] - row * terrain.resolution
+    guess = belief.plane[0] + belief.plane[1] * x + belief.plane[2] * y
+    return jnp.where(_known(terrain, belief, row, column), heights, guess)
 
 
 def _nearest(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Array:
@@ -227,7 +278,7 @@ def _nearest(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Arra
     _, rows, columns = terrain.elevation.shape
     nearest_row, nearest_column = (row + 0.5).astype(jnp.int32), (column + 0.5).astype(jnp.int32)
     index = _flat_index(terrain, rows, columns, nearest_row, nearest_column)
-    return _gather(terrain.elevation, index)
+    return _vertices(terrain, nearest_row, nearest_column, index)
 
 
 def _bilinear(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Array:
@@ -247,8 +298,9 @@ def _corners(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> tuple[ja
     fx, fy = column - c, 1.0 - (row - r)
     top = _flat_index(terrain, rows, columns, r, c)
     bottom = top + columns
-    top_left, top_right = _gather(terrain.elevation, top), _gather(terrain.elevation, top + 1)
-    bottom_left = _gather(terrain.elevation, bottom)
-    bottom_right = _gather(terrain.elevation, bottom + 1)
+    top_left = _vertices(terrain, r, c, top)
+    top_right = _vertices(terrain, r, c + 1, top + 1)
+    bottom_left = _vertices(terrain, r + 1, c, bottom)
+    bottom_right = _vertices(terrain, r + 1, c + 1, bottom + 1)
     along, up = bottom_right - bottom_left, top_left - bottom_left
     return bottom_left, along, up, top_right - top_left - along, fx, fy

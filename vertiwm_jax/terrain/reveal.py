@@ -1,0 +1,124 @@
+"""Maps that become known on the way: what a vehicle has seen of its world, and what it guesses."""
+
+import math
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.belief import MapBelief
+from vertiwm_jax.terrain.map import TerrainMap
+
+NEAR = 4.0
+"""Metres around a vehicle that it knows, wherever it looks: what it stands on."""
+_RINGS, _DIRECTIONS = 6, 12  # of the places in view that the plane is laid through
+
+
+@dataclass(frozen=True)
+class RevealConfig:
+    """How far sensors see, which reveal the map; all of it is known from the start by default."""
+
+    range: float = math.inf
+    """Metres at which the ground, and obstacles by their middle, are seen."""
+    field_of_view: float = 2 * math.pi
+    """Angle about straight ahead, rad, in which they are; what is nearer than 4 m always is."""
+    cells: int = 64
+    """Cells along each side of the map, each of which is known or not."""
+
+    def __post_init__(self):
+        if not self.range > 0:
+            raise ValueError(f"range: expected more than 0 m, found {self.range:g}")
+        if not 0 < self.field_of_view <= 2 * math.pi:
+            raise ValueError(
+                f"field_of_view: expected more than 0 and up to 2 pi rad, "
+                f"found {self.field_of_view:g}"
+            )
+        if self.cells < 1:
+            raise ValueError(f"cells: expected at least 1, found {self.cells}")
+
+    @property
+    def partial(self) -> bool:
+        """Whether anything is unknown at the start."""
+        return math.isfinite(self.range)
+
+
+def check(config: RevealConfig, terrain: TerrainMap) -> None:
+    """`ValueError` if cells are so large that one is not seen where the vehicle stands in it."""
+    rows, columns = terrain.elevation.shape[-2:]
+    width, height = (float(terrain.resolution) * (n - 1) for n in (columns, rows))
+    near = min(config.range, NEAR)
+    if config.partial and math.hypot(width, height) / config.cells > 2 * near:
+        least = math.ceil(math.hypot(width, height) / (2 * near))
+        raise ValueError(
+            f"reveal.cells: expected at least {least} on a map of {width:g} x {height:g} m with a "
+            f"range of {config.range:g} m, found {config.cells}"
+        )
+
+
+def begin(
+    config: RevealConfig, terrain: TerrainMap, position: jax.Array, yaw: jax.Array
+) -> MapBelief | None:
+    """What a vehicle sees first at `[3]` p_world, m, and `[]` yaw, rad; None if it knows all."""
+    if not config.partial:
+        return None
+    below = query.surface(terrain, position[:2])
+    nothing = MapBelief(
+        known=jnp.zeros((config.cells, config.cells), bool),
+        plane=jnp.stack([below.height, *jnp.zeros(2)]),
+        semantic=below.semantic,
+        friction=below.friction,
+    )
+    return look(config, terrain, nothing, position, yaw)
+
+
+def look(
+    config: RevealConfig,
+    terrain: TerrainMap,
+    belief: MapBelief,
+    position: jax.Array,
+    yaw: jax.Array,
+) -> MapBelief:
+    """The belief with what is seen at `[3]` p_world, m, and `[]` yaw, rad.
+
+    Cells are seen by their middle, and stay known. Unknown ground is guessed to lie in the plane
+    of least squares through the ground in view, and to be as the ground below the vehicle.
+    """
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    middles = (np.arange(config.cells, dtype=np.float32) + 0.5) / config.cells
+    _, rows, columns = terrain.elevation.shape
+    east = terrain.origin[0] + middles * ((columns - 1) * terrain.resolution) - position[0]
+    north = terrain.origin[1] - middles * ((rows - 1) * terrain.resolution) - position[1]
+    squared = east**2 + north[:, None] ** 2
+    seen = squared <= config.range**2
+    if config.field_of_view < 2 * math.pi:
+        ahead = cos * east + (sin * north)[:, None]
+        in_view = ahead >= math.cos(config.field_of_view / 2) * jnp.sqrt(squared)
+        seen &= in_view | (squared <= NEAR**2)
+    belief = replace(belief, known=belief.known | seen)
+
+    # As believed, so that places in cells that are not seen tell nothing.
+    ground = replace(terrain, belief=belief)
+    forward, left = _places(config)
+    x, y = cos * forward - sin * left, sin * forward + cos * left
+    heights = query.height(ground, position[:2] + jnp.stack([x, y], axis=-1))
+    fit = np.linalg.pinv(np.stack([np.ones_like(forward), forward, left], axis=-1))
+    level, rise, bank = jnp.dot(fit.astype(np.float32), heights, precision="highest")
+    slope = jnp.stack([cos * rise - sin * bank, sin * rise + cos * bank])
+    below = query.surface(ground, position[:2])
+    return replace(
+        belief,
+        plane=jnp.append(level - jnp.sum(slope * position[:2]), slope),
+        semantic=below.semantic,
+        friction=below.friction,
+    )
+
+
+def _places(config: RevealConfig) -> tuple[np.ndarray, np.ndarray]:
+    """m ahead and m to the left `[P]`, evenly over what is in view."""
+    rings = config.range * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
+    turns = config.field_of_view * ((np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS - 0.5)
+    radius, angle = (x.ravel() for x in np.meshgrid(rings, turns))
+    places = radius * np.cos(angle), radius * np.sin(angle)
+    return places[0].astype(np.float32), places[1].astype(np.float32)
