@@ -22,6 +22,7 @@ from vertiwm_jax.simulators import chrono, pilots, recording
 from vertiwm_jax.simulators.protocol import Observation, SimulatorError
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.reveal import RevealConfig
 from vertiwm_jax.world_model import choice
 
 GRASS, SAND = 3, 8
@@ -252,6 +253,23 @@ def test_a_policy_drives_from_goal_to_goal(maps, eyes):
     task = collect.Task(command, hmmwv(), (policy, config, eyes), alone, 0, drive=1)
     drive = collect.record(task)
     assert drive.control.shape == (20, 2) and np.all(drive.control[:, 0] == 2.5)
+
+
+def test_a_policy_sees_as_far_as_it_did_in_training():
+    """Of hills, one that sees 12 m observes what the level ground around it suggests."""
+    hills = np.zeros((129, 129))
+    hills[:, 80:] = 3.0
+    terrain = terrain_map.build(hills, np.full((16, 16), GRASS))
+    policy = jax.tree_util.Partial(lambda seen, key: jnp.stack([seen.max(), seen.min()]) / 10)
+    state = np.array([0, 0, 0.5, *np.zeros(9)], np.float32)
+    goal, standing = np.array([30.0, 0.0, 0.0]), np.array([-1.0, 0.0])
+    acted = {}
+    for sight in (12.0, np.inf):
+        config = NavigationConfig(reveal=RevealConfig(range=sight))
+        belief, action, _ = pilots._act(config, policy, None, terrain, None, state, goal, standing)
+        acted[sight] = action
+        assert (belief is None) == np.isinf(sight)
+    assert not np.allclose(acted[12.0], acted[np.inf])
 
 
 def test_a_rover_drives_at_full_size(maps, tmp_path):

@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 import signal
+from dataclasses import replace
 
 import chex
 import jax
@@ -17,12 +18,14 @@ from vertiwm_jax import checkpoints, evaluate, export, policy_training, ppo, run
 from vertiwm_jax import config as configuration
 from vertiwm_jax.deploy import run_policy
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
+from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.reveal import RevealConfig
 from vertiwm_jax.world_model import model
 from vertiwm_jax.world_model.choice import choose
 from vertiwm_jax.world_model.model import ModelConfig
@@ -226,6 +229,18 @@ def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch
     options = [f"--shooting.{x}" if i % 2 == 0 else x for i, x in enumerate(small)]
     evaluate.main([*navigate, "shooting", "--suites", "easy", *options])
     assert "| shooting" in capsys.readouterr().out
+
+
+def test_how_far_sensors_see_can_be_asked_for(tmp_path):
+    config = PPOTraining(navigation=NavigationConfig(reveal=RevealConfig(cells=40)))
+    for asked, found in ((None, np.inf), (5.0, 5.0)):
+        command = evaluate.Navigation("random", reveal_range=asked)
+        adapted = evaluate._adapted(config, command).navigation
+        assert adapted == NavigationConfig(reveal=RevealConfig(range=found, cells=40))
+    sighted = replace(config, navigation=NavigationConfig(embeddings=True))
+    configuration.save(sighted, tmp_path / "config.yaml")
+    navigate = ("navigation", "--policy", tmp_path, "--reveal-range", "5")
+    assert "reveal.range: expected inf with embeddings" in refusal(evaluate.main, *navigate)
 
 
 def test_a_policy_drives_another_vehicle(run, tmp_path, capsys):

@@ -171,6 +171,8 @@ class Navigation:
     """Tasks in a world; as many as after training by default."""
     seed: int | None = None
     """Draws other procedural worlds than those held out."""
+    reveal_range: float | None = None
+    """Metres at which sensors reveal the map, inf for all of it; by default as in training."""
     output: Path | None = None
     """Folder for tables, all episodes and pictures."""
 
@@ -332,6 +334,9 @@ def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:
         grounds = replace(grounds, obstacles=command.obstacles)
     if command.vehicle is not None:
         config = replace(config, vehicle=command.vehicle)
+    if command.reveal_range is not None:
+        revealed = replace(config.navigation.reveal, range=command.reveal_range)
+        config = replace(config, navigation=replace(config.navigation, reveal=revealed))
     if command.suites:
         config = replace(config, worlds=None)
     if command.seed is not None:

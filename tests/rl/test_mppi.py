@@ -13,6 +13,7 @@ from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.evaluation.controllers import StraightToGoal
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
+from vertiwm_jax.terrain.reveal import RevealConfig
 
 CONFIG = NavigationConfig(horizon_seconds=15.0)
 KEY = jax.random.key(0)
@@ -54,6 +55,22 @@ def test_it_drives_around_what_driving_straight_runs_into(blocked):
     env, params = blocked
     straight = navigation.evaluate(env, params, StraightToGoal(CONFIG), KEY)
     assert (straight.ending == Ending.COLLIDED).all()
+    found = navigation.evaluate(env, params, driver(env), KEY)
+    assert (found.ending == Ending.GOAL).all()
+
+
+def test_it_plans_in_what_it_has_seen_of_the_map():
+    """What stands out of range changes no plan, and what comes into range is driven around."""
+    seeing = replace(CONFIG, reveal=RevealConfig(range=12.0))
+    intended = {}
+    for config in (seeing, CONFIG):
+        env, params = worlds.blocked(config)
+        empty = replace(params, terrain=ground(obstacles=np.zeros((1, 5))))
+        far = driver(env, decisions=10)
+        intended[config] = [decided(env, x, far) for x in (params, empty)]
+    np.testing.assert_array_equal(*intended[seeing])
+    assert not np.allclose(*intended[CONFIG])
+    env, params = worlds.blocked(seeing)
     found = navigation.evaluate(env, params, driver(env), KEY)
     assert (found.ending == Ending.GOAL).all()
 

@@ -21,8 +21,10 @@ from vertiwm_jax.env.termination import Ending, edge_distance, first_ending, is_
 from vertiwm_jax.env.variation import Variation, VariationConfig
 from vertiwm_jax.networks.policy import Senses
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
-from vertiwm_jax.terrain import obstacles, query
+from vertiwm_jax.terrain import obstacles, query, reveal
+from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.reveal import RevealConfig
 
 _SETTLED_TOGETHER = 256  # vehicles, of which each has patches in every step
 
@@ -42,6 +44,7 @@ class NavigationConfig:
     plausible_disagreement: m by which its parts may disagree in a step before it has diverged.
     settle_steps: steps of standing still before a start is handed out.
     embeddings: whether an observation ends with the ground as the model's encoders see it.
+    reveal: what sensors reveal of a map that is not known; by default all of it is.
     """
 
     goal_radius: float = 8.0
@@ -59,6 +62,14 @@ class NavigationConfig:
     embeddings: bool = False
     chassis: Chassis = dataclasses.field(default_factory=Chassis)
     reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
+    reveal: RevealConfig = RevealConfig()
+
+    def __post_init__(self) -> None:
+        if self.reveal.partial and self.embeddings:
+            raise ValueError(
+                "reveal.range: expected inf with embeddings, which show all of the map, "
+                f"found {self.reveal.range:g}"
+            )
 
     def command(self, action: jax.Array) -> Command:
         """`[..., 2]` action, clipped to [-1, 1], to the command it stands for."""
@@ -84,6 +95,7 @@ class NavigationState(environment.EnvState):
     time: `[]` int32 steps done; stalled: `[]` int32 steps stalled without a break.
     ending: `[]` int32 `Ending` code.
     variation: how this episode differs from what the map says.
+    belief: what the vehicle has seen of its world; None where it knows all of the map.
     """
 
     vehicle: VehicleState
@@ -94,6 +106,7 @@ class NavigationState(environment.EnvState):
     stalled: jax.Array
     ending: jax.Array
     variation: Variation
+    belief: MapBelief | None = None
 
 
 @struct.dataclass(kw_only=True)
@@ -115,6 +128,13 @@ class NavigationParams(environment.EnvParams):
     def pool_size(self) -> int:
         """P, the number of starts."""
         return self.start_observation.shape[0]
+
+    def believed(self, state: NavigationState) -> TerrainMap:
+        """The world of an episode as far as its vehicle has seen it: what may drive it by."""
+        terrain = self.terrain.select(state.world)
+        if state.belief is None:
+            return terrain
+        return dataclasses.replace(terrain, belief=state.belief)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,6 +251,10 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
             ending=ending,
         )
         gain = jnp.where(running, gain, 0.0)
+        belief = state.belief
+        if belief is not None:
+            seen = reveal.look(config.reveal, terrain, belief, vehicle.position, yaw)
+            belief = jax.tree.map(partial(jnp.where, running), seen, belief)
         new = dataclasses.replace(
             state,
             vehicle=vehicle,
@@ -240,6 +264,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
             stalled=stalled,
             ending=ending,
             variation=variation,
+            belief=belief,
         )
         info = {
             "ending": ending,
@@ -258,7 +283,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
     ) -> jax.Array:
         """`[O]` float32, see `observation.observe`, and the model's embedding of the ground."""
         del key, action
-        return self._see(params.terrain.select(state.world), state)
+        return self._see(params.believed(state), state)
 
     def is_terminated(self, state: NavigationState, params: NavigationParams) -> jax.Array:
         """Whether the task itself is over."""
@@ -311,6 +336,7 @@ def _make_params(
     env: NavigationEnv, dynamics: Params, terrain: TerrainMap, pool: Tasks
 ) -> NavigationParams:
     config = env.config
+    reveal.check(config.reveal, terrain)
     pool = tasks.validate(pool, terrain, config.goal_radius, config.map_margin)
     settle = devices.shared_out(partial(_settle, env), len(pool.world))
     starts, start_observation = settle(dynamics, terrain, pool)
@@ -376,8 +402,9 @@ def _settle(
             stalled=zero,
             ending=zero,
             variation=Variation.draw(env.variation, jax.random.key(0), action),
+            belief=reveal.begin(env.config.reveal, selected, vehicle.position, vehicle.rpy[2]),
         )
-        return state, env._see(selected, state)
+        return state, env._see(dataclasses.replace(selected, belief=state.belief), state)
 
     # Not all at once: patches of thousands of vehicles fill gigabytes.
     settled = devices.spread(settle, (None, None, 0), _SETTLED_TOGETHER)(dynamics, terrain, pool)

@@ -72,7 +72,7 @@ class Imagining(Driver):
 
     def start(self, params: NavigationParams, state: NavigationState) -> Plan:
         """The model's first history, and no correction."""
-        terrain = params.terrain.select(state.world)
+        terrain = params.believed(state)
         history = self.env.dynamics.init(self.dynamics, terrain, state.vehicle)
         return Plan(history, jnp.zeros((self.planned, 2)))
 
@@ -86,7 +86,7 @@ class Imagining(Driver):
     ) -> tuple[jax.Array, Plan]:
         """The base, corrected as planned; the model's history follows the vehicle."""
         action = corrected(self.base, observation, key, memory.corrections[0])
-        terrain, command = params.terrain.select(state.world), self.env.config.command(action)
+        terrain, command = params.believed(state), self.env.config.command(action)
         _, history = self.env.dynamics.step(
             self.dynamics, terrain, memory.history, state.vehicle, command
         )
@@ -120,8 +120,9 @@ class Imagining(Driver):
     def inside(
         self, params: NavigationParams, memory: Plan, state: NavigationState
     ) -> tuple[NavigationParams, NavigationState]:
-        """The task as it is now, inside the model."""
-        return replace(params, dynamics=self.dynamics), replace(state, history=memory.history)
+        """The task as it is now, inside the model; what is believed of the map is true there."""
+        params = replace(params, dynamics=self.dynamics, terrain=params.believed(state))
+        return params, replace(state, history=memory.history, belief=None)
 
     def hold(
         self, params: NavigationParams, future: Future, correction: jax.Array, key: jax.Array

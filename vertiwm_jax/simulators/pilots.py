@@ -1,7 +1,7 @@
 """Where recorded drives start, and what commands them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,8 @@ from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
-from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain import query, reveal
+from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.perception import Eyes
 
@@ -98,15 +99,15 @@ class Learned:
         standing = Command(jnp.float32(0), jnp.float32(0))
         self._action = np.asarray(self.config.action(standing))
         self._goal: np.ndarray | None = None
+        self._belief: MapBelief | None = None
 
     def __call__(self, state: np.ndarray) -> np.ndarray:
         """The policy's command at the state `[12]`."""
         goal = self._goal
         if goal is None or np.linalg.norm(goal - state[:3]) < self.config.goal_radius:
             self._goal = goal = self._draw_goal(state[:2])
-        self._action, command = jax.device_get(
-            _act(self.config, self.policy, self.eyes, self.terrain, state, goal, self._action)
-        )
+        own = self.config, self.policy, self.eyes, self.terrain, self._belief
+        self._belief, self._action, command = jax.device_get(_act(*own, state, goal, self._action))
         return command
 
     def _draw_goal(self, xy: np.ndarray) -> np.ndarray:
@@ -123,18 +124,25 @@ def _act(
     policy: Policy,
     eyes: Eyes | None,
     terrain: TerrainMap,
+    belief: MapBelief | None,
     state: jax.Array,
     goal: jax.Array,
     action: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """The next action `[2]` and the command `[2]` that it stands for."""
+) -> tuple[MapBelief | None, jax.Array, jax.Array]:
+    """What is known of the map, the next action `[2]` and the command `[2]` that it stands for."""
     vehicle = VehicleState.from_vector(state)
+    pose = vehicle.position, vehicle.rpy[2]
+    if belief is None:
+        belief = reveal.begin(config.reveal, terrain, *pose)
+    else:
+        belief = reveal.look(config.reveal, terrain, belief, *pose)
+    terrain = replace(terrain, belief=belief)
     seen = observation.observe(terrain, config.chassis, vehicle, goal, action)
     if eyes:
         seen = observation.with_embedding(seen, eyes(terrain, vehicle).latent)
     # No learned policy is random.
     action = jnp.clip(policy(seen, jax.random.key(0)), -1.0, 1.0)
-    return action, config.command(action).vector
+    return belief, action, config.command(action).vector
 
 
 @jax.jit

@@ -1,0 +1,130 @@
+"""The task on a map that only becomes known on the way."""
+
+from dataclasses import replace
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from env.worlds import bicycle_env, ground, hills, task
+
+from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.observation import arcs_ahead
+from vertiwm_jax.env.tasks import circle_tasks
+from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.terrain.reveal import RevealConfig
+
+KEY = jax.random.key(0)
+REVEALED = NavigationConfig(reveal=RevealConfig(range=12.0))
+TASK = task((-30.0, 0.0), (30.0, 0.0))
+AHEAD = jnp.array([0.6, 0.0])
+
+
+def drive(env, params, steps=70):
+    """Observations and states of each step, `[T, ...]`."""
+
+    @jax.jit
+    def driven(params):
+        def advance(state, _):
+            observation, state, *_ = env.step_env(KEY, state, AHEAD, params)
+            return state, (observation, state)
+
+        return jax.lax.scan(advance, env.start(params, jnp.int32(0))[1], length=steps)[1]
+
+    return driven(params)
+
+
+def stepped(at):
+    """Hills with a step of 2 m across the way, `at` m from the middle."""
+    return ground(hills() + 2.0 * (np.arange(129) - 64 >= at).astype(np.float32))
+
+
+def test_what_was_not_seen_is_neither_observed_nor_missed():
+    """A step in the ground is observed once it is in range, and changes nothing before."""
+    env, params = bicycle_env(ground(hills()), TASK, REVEALED)
+    other = replace(params, terrain=stepped(6.0))
+    (seen, states), (found, others) = drive(env, params), drive(env, other)
+    chex.assert_trees_all_equal(states.belief.known, others.belief.known)
+    # Cells are 2 m wide, and seen by their middle.
+    x = np.asarray(states.vehicle.position[:, 0])
+    far, near = x < 6.0 - 12.0, x > 6.0 - 12.0 + 2.0
+    assert near.sum() > 5 and far.sum() > 5
+    np.testing.assert_array_equal(seen[far], found[far])
+    assert (np.abs(seen - found).max(axis=1) > 0.1)[near].all()
+
+    env, params = bicycle_env(ground(hills()), TASK)
+    (seen, _), (found, _) = drive(env, params), drive(env, replace(params, terrain=stepped(6.0)))
+    assert not np.allclose(seen[far], found[far])
+
+
+def test_the_vehicle_follows_the_true_ground():
+    (_, hidden), (_, known) = (
+        drive(*bicycle_env(ground(hills()), TASK, config))
+        for config in (REVEALED, NavigationConfig())
+    )
+    chex.assert_trees_all_equal(hidden.vehicle, known.vehicle)
+
+
+def test_sensors_that_see_everything_show_what_a_known_map_shows():
+    everything = NavigationConfig(reveal=RevealConfig(range=200.0))
+    rocks = [[9.0, 2.0, 4.0, 4.0, 2.0]]
+    observed = [
+        drive(*bicycle_env(ground(hills(), rocks), TASK, config))[0]
+        for config in (everything, NavigationConfig())
+    ]
+    np.testing.assert_allclose(*observed, atol=1e-5)
+
+
+def test_a_known_map_has_no_belief():
+    env, params = bicycle_env(ground(hills()), TASK)
+    state = env.reset_env(KEY, params)[1]
+    assert state.belief is None and params.believed(state).belief is None
+
+
+def test_a_wall_is_seen_when_it_comes_into_range():
+    rock = [[0.0, 0.0, 4.0, 4.0, 2.0]]
+    env, params = bicycle_env(ground(obstacles=rock), TASK, REVEALED)
+    seen, states = drive(env, params, 80)
+    crown = np.asarray(jax.vmap(arcs_ahead)(seen)[1]).max(axis=(1, 2))
+    gap = -np.asarray(states.vehicle.position[:, 0])
+    assert (crown[gap > 14.0] < 1e-3).all() and (crown[(gap < 10.5) & (gap > 6)] > 1).all()
+    assert Ending(int(states.ending[-1])) == Ending.COLLIDED
+    # An episode that is over stays as it is.
+    over = np.flatnonzero(np.asarray(states.ending) != Ending.RUNNING)
+    first, last = (jax.tree.map(lambda x, i=i: x[i], states.belief) for i in over[[0, -1]])
+    chex.assert_trees_all_equal(first, last)
+
+
+def test_many_are_stepped_in_one_program_and_begin_anew_with_what_they_see_there():
+    config = replace(REVEALED, horizon_seconds=0.5)
+    terrain = ground(hills())
+    env, params = bicycle_env(terrain, circle_tasks(terrain, radius=50.0), config)
+    n = 6
+    states = jax.vmap(env.reset, (0, None))(jax.random.split(KEY, n), params)[1]
+    chex.clear_trace_counter()
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def step(key, states, params):
+        keys, actions = jax.random.split(key, n), jnp.broadcast_to(AHEAD, (n, 2))
+        return jax.vmap(env.step, (0, 0, 0, None))(keys, states, actions, params)
+
+    for i in range(1, 6):
+        before = states
+        observation, states, *_ = step(jax.random.key(i), states, params)
+        grown = np.asarray(states.belief.known | before.belief.known == states.belief.known)
+        assert grown.all() == (i < 5)
+    first = set(map(bytes, np.asarray(params.starts.belief.known)))
+    assert {bytes(known) for known in np.asarray(states.belief.known)} <= first
+    assert set(map(bytes, np.asarray(observation))) <= set(
+        map(bytes, np.asarray(params.start_observation))
+    )
+
+
+def test_what_does_not_go_together_is_refused():
+    with pytest.raises(ValueError, match=r"reveal.range: expected inf with embeddings"):
+        NavigationConfig(embeddings=True, reveal=RevealConfig(range=12.0))
+    coarse = NavigationConfig(reveal=RevealConfig(range=12.0, cells=8))
+    with pytest.raises(ValueError, match=r"reveal.cells: expected at least 23"):
+        bicycle_env(ground(hills()), TASK, coarse)
