@@ -25,7 +25,8 @@ class Driver(ABC):
     """Decides every `interval` steps and acts at each, and carries a memory of its own.
 
     A pytree, like a `Policy`; `interval` is static. It sees the state that the task is in, which
-    its methods get of one episode; the parameters are those of the environment that it drives in.
+    its methods get of one episode; the parameters are those of the environment that it drives in,
+    of whose terrain it may know what `params.believed(state)` gives.
     """
 
     interval = 1
