@@ -243,6 +243,23 @@ def test_how_far_sensors_see_can_be_asked_for(tmp_path):
     assert "reveal.range: expected inf with embeddings" in refusal(evaluate.main, *navigate)
 
 
+class Driven(Exception):
+    """What was about to be driven."""
+
+
+def test_a_policy_of_a_known_map_drives_on_one_that_is_revealed(run, monkeypatch):
+    def drive(*arguments):
+        raise Driven(*arguments)
+
+    monkeypatch.setattr(evaluate.report, "drive", drive)
+    navigate = ["navigation", "--policy", str(run), "--suites", "easy", "--reveal-range", "12"]
+    with pytest.raises(Driven) as found:
+        evaluate.main(navigate)
+    env, params, policies, *_ = found.value.args
+    assert env.config.reveal.range == 12.0 and params.starts.belief is not None
+    assert any(name.startswith("ppo") for name in policies)
+
+
 def test_a_policy_drives_another_vehicle(run, tmp_path, capsys):
     navigate = ("navigation", "--policy", run, "--suites", "easy", "--output")
     evaluate.main([*map(str, navigate), str(tmp_path / "hmmwv")])

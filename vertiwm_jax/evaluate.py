@@ -286,7 +286,8 @@ def _navigate(command: Navigation) -> None:
     run = command.policy if isinstance(command.policy, Path) else None
     file = run / "config.yaml" if run else configuration.default_config("ppo")
     try:
-        config = _adapted(training(file), command)
+        trained = training(file)
+        config = _adapted(trained, command)
         if command.simulator == "chrono" and config.vehicle != HMMWV:
             raise ConfigError(f"vehicle: expected {HMMWV} in Chrono, found {config.vehicle}")
         maps, scale = command.worlds, config.driven.scale
@@ -297,7 +298,9 @@ def _navigate(command: Navigation) -> None:
         sys.exit(f"error: {error}")
     policies = baselines(config.asked)
     if run:
-        policies = policy_training.learned(config, terrain, run) | policies
+        # Checkpoints hold episodes, which know as much of the map as in training.
+        own = replace(config, navigation=trained.navigation)
+        policies = policy_training.learned(own, terrain, run) | policies
     elif command.policy == "mppi":
         dynamics, weights = task.dynamics(config, command.mppi.model)
         env = NavigationEnv(dynamics, config.asked)
