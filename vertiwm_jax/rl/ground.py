@@ -38,7 +38,7 @@ class GroundConfig:
     """How many of each suite."""
     held_out_every: int = 5
     """Of given maps, every so-manieth is not trained on but tested on."""
-    starts: int = 4096
+    starts: int = 1024
     """Random tasks to train on, beside those across the circle of every world."""
     pairs: int = 10
     """Tasks across the circle of a world."""

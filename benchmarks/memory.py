@@ -1,0 +1,66 @@
+"""Memory of the default training, in MB: what is kept of worlds, starts and learning, and the most.
+
+The most is the resident size of a process, compiled programs and Python included.
+"""
+
+import resource
+import sys
+
+import jax
+
+from benchmarks._harness import parser, report
+from vertiwm_jax import config as configuration
+from vertiwm_jax import devices
+from vertiwm_jax.ppo import PPOTraining
+from vertiwm_jax.rl import task
+
+_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes, of `ru_maxrss`
+
+
+def most() -> float:
+    """MB that this process has had at most."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _UNIT / 1e6
+
+
+def size(tree: object) -> float:
+    """MB of the arrays of a pytree, of one copy of it."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree)) / 1e6
+
+
+def main() -> None:
+    arguments = parser(__doc__)
+    arguments.add_argument("--config", default="ppo", help="a configuration of PPO")
+    arguments.add_argument("--iterations", type=int, default=2)
+    chosen = arguments.parse_args()
+    results = {"imported": {"most_MB": most()}}
+    file = configuration.default_config(chosen.config)
+    config = configuration.load(PPOTraining, file)
+    training, _ = task.training_environment(config)
+    jax.block_until_ready(training.params)
+    params = training.params
+    results["worlds and starts"] = {
+        "most_MB": most(),
+        "terrain_MB": size(params.terrain),
+        "starts_MB": size(params.starts),
+    }
+    algorithm = config.algorithm(training.env)
+    mesh = devices.mesh(config.ppo.shareable)
+    state = jax.jit(algorithm.init)(params, config.key("training"))
+    params, state = devices.everywhere(mesh, (params, state))
+    del training
+    whole = jax.tree.map(lambda leaf: leaf.sharding, state)
+    iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=(whole, None))
+    with jax.set_mesh(mesh):
+        for _ in range(chosen.iterations):
+            state, _ = iterate(params, state)
+    jax.block_until_ready(state)
+    results["learning"] = {
+        "most_MB": most(),
+        "state_MB": size(jax.eval_shape(lambda x: x, state)),
+        "devices": mesh.size,
+    }
+    report("memory", results, chosen.json)
+
+
+if __name__ == "__main__":
+    main()
