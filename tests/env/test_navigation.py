@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from env.worlds import BICYCLE, Scripted, bicycle_env, ground, hills, task
+from env.worlds import BICYCLE, Scripted, bicycle_env, ground, hills, step_of_many, task
 from flax import struct
 
 from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
@@ -187,14 +187,7 @@ def test_step_compiles_once_and_resets_by_itself():
     env, params = bicycle_env(terrain, circle_tasks(terrain, radius=50.0), config)
     n = 16
     states = jax.vmap(env.reset, (0, None))(jax.random.split(KEY, n), params)[1]
-    chex.clear_trace_counter()
-
-    @jax.jit
-    @chex.assert_max_traces(n=1)
-    def step(key, states, params):
-        keys, actions = jax.random.split(key, n), jnp.broadcast_to(AHEAD, (n, 2))
-        return jax.vmap(env.step, (0, 0, 0, None))(keys, states, actions, params)
-
+    step = step_of_many(env, AHEAD)
     for i in range(1, 6):
         _, states, _, terminated, truncated, info = out = step(jax.random.key(i), states, params)
         assert not terminated.any() and truncated.all() == (i == 5)

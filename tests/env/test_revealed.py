@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from env.worlds import bicycle_env, ground, hills, task
+from env.worlds import bicycle_env, ground, hills, step_of_many, task
 
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.observation import arcs_ahead
@@ -102,14 +102,7 @@ def test_many_are_stepped_in_one_program_and_begin_anew_with_what_they_see_there
     env, params = bicycle_env(terrain, circle_tasks(terrain, radius=50.0), config)
     n = 6
     states = jax.vmap(env.reset, (0, None))(jax.random.split(KEY, n), params)[1]
-    chex.clear_trace_counter()
-
-    @jax.jit
-    @chex.assert_max_traces(n=1)
-    def step(key, states, params):
-        keys, actions = jax.random.split(key, n), jnp.broadcast_to(AHEAD, (n, 2))
-        return jax.vmap(env.step, (0, 0, 0, None))(keys, states, actions, params)
-
+    step = step_of_many(env, AHEAD)
     for i in range(1, 6):
         before = states
         observation, states, *_ = step(jax.random.key(i), states, params)

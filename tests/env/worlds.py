@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -87,3 +88,17 @@ class Scripted:
         there = jax.tree.map(lambda x: x[jnp.maximum(history, 0)], params)
         moved = jax.tree.map(lambda a, b: jnp.where(history < 0, a, b), state, there)
         return moved, history + 1
+
+
+def step_of_many(env: NavigationEnv, action: jax.Array):
+    """Steps `(key, states, params)` of all with one action, compiled once and no second time."""
+    chex.clear_trace_counter()
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def step(key, states, params):
+        number = len(states.time)
+        keys, actions = jax.random.split(key, number), jnp.broadcast_to(action, (number, 2))
+        return jax.vmap(env.step, (0, 0, 0, None))(keys, states, actions, params)
+
+    return step
