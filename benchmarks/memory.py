@@ -33,8 +33,7 @@ def main() -> None:
     arguments.add_argument("--iterations", type=int, default=2)
     chosen = arguments.parse_args()
     results = {"imported": {"most_MB": most()}}
-    file = configuration.default_config(chosen.config)
-    config = configuration.load(PPOTraining, file)
+    config = configuration.load(PPOTraining, configuration.default_config(chosen.config))
     training, _ = task.training_environment(config)
     jax.block_until_ready(training.params)
     params = training.params
@@ -48,15 +47,15 @@ def main() -> None:
     state = jax.jit(algorithm.init)(params, config.key("training"))
     params, state = devices.everywhere(mesh, (params, state))
     del training
-    whole = jax.tree.map(lambda leaf: leaf.sharding, state)
-    iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=(whole, None))
+    everywhere = devices.on_all(mesh)
+    iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=everywhere)
     with jax.set_mesh(mesh):
         for _ in range(chosen.iterations):
             state, _ = iterate(params, state)
     jax.block_until_ready(state)
     results["learning"] = {
         "most_MB": most(),
-        "state_MB": size(jax.eval_shape(lambda x: x, state)),
+        "state_MB": size(state),
         "devices": mesh.size,
     }
     report("memory", results, chosen.json)

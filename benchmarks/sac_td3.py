@@ -5,27 +5,21 @@ follows.
 """
 
 from dataclasses import replace
-from pathlib import Path
 
 from benchmarks._harness import Figures, parser, report
 from benchmarks.ppo_throughput import iteration
 from vertiwm_jax import config as configuration
+from vertiwm_jax import evaluate
 from vertiwm_jax.rl import task
-from vertiwm_jax.sac import SACTraining
-from vertiwm_jax.td3 import TD3Training
 from vertiwm_jax.world_model.choice import ModelName
 
 
 def of_task(name: str, model: ModelName) -> Figures:
     """An iteration of the default training by `sac` or `td3`, inside a model."""
-    file: Path = configuration.default_config(name)
-    if name == "sac":
-        config = configuration.load(SACTraining, file)
-        config = replace(config, sac=replace(config.sac, warm_up=config.sac.num_envs))
-    else:
-        config = configuration.load(TD3Training, file)
-        config = replace(config, td3=replace(config.td3, warm_up=config.td3.num_envs))
-    training, _ = task.training_environment(replace(config, model=model))
+    config = evaluate.training(configuration.default_config(name))
+    soon = replace(getattr(config, name), warm_up=config.schedule.num_envs)
+    config = replace(config, model=model, **{name: soon})
+    training, _ = task.training_environment(config)
     return iteration(config.algorithm(training.env), training.params, config.action_repeat)
 
 

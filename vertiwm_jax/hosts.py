@@ -30,10 +30,9 @@ _PATIENCE = 60  # seconds that a process waits for the others at its end, whatev
 
 def command() -> str:
     """NAME where `python -m vertiwm_jax.NAME` is what runs, or else nothing."""
+    package = f"{__package__}."
     words = (word.removeprefix("-m") for word in sys.orig_argv)
-    return next((word for word in words if word.startswith(f"{__package__}.")), "").partition(".")[
-        2
-    ]
+    return next((w.removeprefix(package) for w in words if w.startswith(package)), "")
 
 
 def join(command: str) -> None:
@@ -68,7 +67,8 @@ def join(command: str) -> None:
             f"{[each[index] for index in sorted(each)]}; JAX_NUM_CPU_DEVICES sets those of a CPU"
         )
     if not is_first():
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+        # For as long as it runs: what the first one prints is what there is to say. Errors stay.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def is_first() -> bool:

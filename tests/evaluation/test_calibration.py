@@ -50,6 +50,20 @@ def test_parts_are_fifths_in_the_order_of_disagreement():
     assert "| mean error, m | 10.000 | 20.000 | 30.000 | 40.000 | 50.000 |" in table
 
 
+def test_the_picture_has_every_bound_and_how_often_it_held():
+    (error, disagreement), tested = errors(0), errors(1, count=500)
+    known, constant = Calibration.measure(error, disagreement), Calibration.measure(error, None)
+    left, right = calibration.picture(known, *tested, constant).axes
+    drawn = {line.get_label(): line.get_xydata() for line in left.lines}
+    place, bound = drawn["bound for 90%"].T
+    np.testing.assert_allclose(bound, known.bound(place, 0.9))
+    held = {line.get_label(): line.get_xydata() for line in right.lines}
+    level, share = held["from disagreement, where it is most"].T
+    np.testing.assert_allclose(share, level, atol=0.12)
+    level, share = held["not from disagreement, where it is most"].T
+    assert np.max(level - share) > 0.12
+
+
 @struct.dataclass
 class Step:
     count: object

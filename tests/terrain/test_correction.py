@@ -33,13 +33,13 @@ def test_measured_heights_stand_where_they_were_measured(corner):
 
 @pytest.mark.parametrize("corner", [(5.0, 5.0), (-70.0, 63.0)])
 def test_measured_classes_are_met_there(corner):
-    semantic = np.array([[SNOW, -1, ROCK], [ROCK, SNOW, -1]])
+    semantic = np.array([[SNOW, -1, ROCK], [ROCK, SNOW, 10]])  # there are ten classes
     friction = np.full((2, 3), 0.7, np.float32)
     found = correction.classes(WORLDS, jnp.asarray(corner), semantic, friction)
     expected = np.full((2, 16, 16), GRASS)
     row, column = int((ORIGIN[1] - corner[1]) // 8), int((corner[0] - ORIGIN[0]) // 8)
     for i, j in np.ndindex(semantic.shape):
-        if semantic[i, j] >= 0 and row + i >= 0 and column + j >= 0:
+        if 0 <= semantic[i, j] < 10 and row + i >= 0 and column + j >= 0:
             expected[1, row + i, column + j] = semantic[i, j]
     np.testing.assert_array_equal(found.semantic, expected)
     changed = expected != GRASS

@@ -109,8 +109,7 @@ def coverage(
     calibration: Calibration, error: np.ndarray, disagreement: np.ndarray
 ) -> list[Coverage]:
     """How often its bounds held for errors `[N]`, m, of predictions with disagreements `[N]`, m."""
-    parts = np.array_split(np.argsort(disagreement, kind="stable"), PARTS)
-    rows = []
+    parts, rows = _parts(disagreement), []
     for level in LEVELS:
         bound = calibration.bound(disagreement, level)
         held = error <= bound
@@ -121,7 +120,7 @@ def coverage(
 
 def format_parts(error: np.ndarray, disagreement: np.ndarray) -> str:
     """A Markdown table of errors `[N]` by disagreements `[N]`, m."""
-    parts = np.array_split(np.argsort(disagreement, kind="stable"), PARTS)
+    parts = _parts(disagreement)
     rows = {
         "largest disagreement in a step, m": [disagreement[part].mean() for part in parts],
         "mean error, m": [error[part].mean() for part in parts],
@@ -153,8 +152,7 @@ def picture(
     The second panel is of the fifths with least and with most disagreement, for bounds that know
     of it and for those that do not: on the diagonal, a bound holds as often as it says.
     """
-    order = np.argsort(disagreement, kind="stable")
-    ends = np.array_split(order, PARTS)[0], np.array_split(order, PARTS)[-1]
+    parts, ordered = _parts(disagreement), np.sort(disagreement)
     levels = np.linspace(0.02, 0.98, 49)
     with style():
         figure = sheet(7.2, 3.5)
@@ -162,15 +160,13 @@ def picture(
         left.plot(disagreement, error, ".", color="0.6", markersize=2.5)
         for i, level in enumerate(LEVELS):
             colour, dash = line(i)
-            bounds = calibration.bound(disagreement[order], level)
-            left.plot(
-                disagreement[order], bounds, dash, color=colour, label=f"bound for {level:.0%}"
-            )
+            bounds = calibration.bound(ordered, level)
+            left.plot(ordered, bounds, dash, color=colour, label=f"bound for {level:.0%}")
         left.set(xlabel="largest disagreement in a step [m]", ylabel="position error [m]")
         left.set(xscale="log", yscale="log", ylim=(np.quantile(error, 0.005), None))
         for i, (name, bounds) in enumerate({"": calibration, "not ": constant}.items()):
             colour, _ = line(i)
-            for end, rows, dash in (("least", ends[0], "-"), ("most", ends[1], "--")):
+            for end, rows, dash in (("least", parts[0], "-"), ("most", parts[-1], "--")):
                 limits = [bounds.bound(disagreement[rows], level) for level in levels]
                 held = [np.mean(error[rows] <= limit) for limit in limits]
                 label = f"{name}from disagreement, where it is {end}"
@@ -180,3 +176,8 @@ def picture(
         for axes in (left, right):
             axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize=7)
     return figure
+
+
+def _parts(disagreement: np.ndarray) -> list[np.ndarray]:
+    """Rows of the equal parts of windows, from least disagreement to most."""
+    return np.array_split(np.argsort(disagreement, kind="stable"), PARTS)

@@ -27,8 +27,8 @@ def classes(
     """The map with measured ground classes in its selected world.
 
     semantic: `[h, w]` class ids, on the cells south and east of the one in which `[2]` corner lies,
-    p_world in m. friction: `[h, w]` friction coefficients; not used on soil. Ids below 0, and what
-    lies off the map, leave the map as it is. Other shapes raise `ValueError`.
+    p_world in m. friction: `[h, w]` friction coefficients; not used on soil. Ids of no class, and
+    what lies off the map, leave the map as it is. Other shapes raise `ValueError`.
     """
     _check_shapes(corner, semantic=semantic, friction=friction)
     _, rows, columns = terrain.elevation.shape
@@ -38,7 +38,7 @@ def classes(
         jnp.floor(row * cell_rows / (rows - 1)),
         jnp.floor(column * cell_columns / (columns - 1)),
     )
-    known = semantic >= 0
+    known = (semantic >= 0) & (semantic < len(terrain.class_names))
     soft = terrain.deformable[jnp.where(known, semantic, 0)]
     friction = jnp.where(soft, 0.0, friction)
     return replace(
