@@ -52,8 +52,8 @@ def parts(batch: int) -> dict[str, Part]:
             Proposal.of(state, second, history.nesam.perception),
         )
         context = fusion.context(state, command, *proposals, model.gate_terrain)
-        alpha, hidden = model.weigh(params.gate, context, history.hidden)
-        return fusion.fuse(state, *proposals, alpha), hidden
+        alphas, hidden = model.weigh(params.gate, context, history.hidden)
+        return fusion.fuse(state, *proposals, alphas.mean(axis=0)), hidden
 
     driven = (state, command)
     return {

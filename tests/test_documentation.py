@@ -4,6 +4,7 @@ import importlib
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -39,12 +40,16 @@ def test_examples_run_from_top_to_bottom(name, tmp_path, monkeypatch):
         exec(compile(block, name, "exec"), names)
 
 
+def users():
+    """The environment of who runs a command in a folder of his own."""
+    own = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    return own | {"PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), own.get("PYTHONPATH")]))}
+
+
 @pytest.mark.slow
 def test_your_own_map_from_top_to_bottom(tmp_path, monkeypatch):
     """Every line as it stands, examples and commands, in a folder of its own: 15 minutes."""
     monkeypatch.chdir(tmp_path)
-    users = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    users["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), users.get("PYTHONPATH")]))
     names, run = {"__name__": "example"}, "ppo-<date>-<time>"
     page = (ROOT / "docs/own-map.md").read_text(encoding="utf-8")
     for language, block in re.findall(r"```(\w+)\n(.*?)```", page, re.DOTALL):
@@ -56,7 +61,7 @@ def test_your_own_map_from_top_to_bottom(tmp_path, monkeypatch):
                 line = line.replace(run, max(Path("runs").glob("ppo-*")).name)
             python, *rest = shlex.split(line)
             assert python == "python"
-            subprocess.run([sys.executable, *rest], check=True, env=users)
+            subprocess.run([sys.executable, *rest], check=True, env=users())
     (trained,) = Path("runs").glob("ppo-*")
     assert {"summary.md", "learning_curves.png"} <= {file.name for file in trained.iterdir()}
 
@@ -69,6 +74,69 @@ def commands():
                 command = line.partition("#")[0].rpartition("&& ")[2].strip()
                 if command.startswith("python -m vertiwm_jax"):
                     yield pytest.param(command, id=f"{page.name}: {command}")
+
+
+FEW = "{updates: 1, updates_per_iteration: 1, warm_up: 0}"
+SHORT = {
+    "policy.yaml": """
+ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 2}
+navigation: {horizon_seconds: 3, settle_steps: 2}
+action_repeat: 2
+""",
+    "ppo.yaml": "ppo: {transitions: 64, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1}",
+    "sac.yaml": "sac: {transitions: 128, num_envs: 8, num_steps: 8, warm_up: 64, batch: 8}",
+    "table.yaml": """
+rows: [{algorithm: ppo, model: builtin}]
+suites: [easy]
+suite_worlds: 1
+settings: .
+""",
+    "fit.yaml": f"""
+windows: {{batch: 2, validation: 2}}
+patches: {{batch: 2, validation: 2}}
+transformer: {{autoencoders: {FEW}, single_steps: {FEW}, rollouts: {FEW}}}
+nesam: {{autoencoders: {FEW}, single_steps: {FEW}, rollouts: {FEW}}}
+soil: {FEW}
+gate: {{rollouts: {FEW}}}
+""",
+}
+"""Settings with which commands do all that they do, but little of it."""
+SHORTENED = {
+    "ppo": "--config ppo.yaml",
+    "sac": "--config sac.yaml",
+    "compare": "--config table.yaml",
+    "collect": "--seconds 6 --kinds mixed --difficulties low --repeats 1",
+    "fit": "--config fit.yaml",
+    "evaluate prediction": "--stride 400",
+    "evaluate navigation": "",
+    "export": "",
+    "view": "",
+}
+"""What makes the commands of the README short."""
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_readme_one_after_the_other(tmp_path, monkeypatch):
+    """Each in a folder of its own with what it names, shortened: 15 minutes."""
+    monkeypatch.chdir(tmp_path)
+    for name, settings in SHORT.items():
+        shared = SHORT["policy.yaml"] if name in ("ppo.yaml", "sac.yaml") else ""
+        Path(name).write_text(shared + settings)
+    shutil.copy("ppo.yaml", "my.yaml")
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    (tmp_path / "MAPS").symlink_to(ROOT / "data" / "open" / "maps")
+    env = users() | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "compiled")}
+    done = []
+    for shown in (found.values[0] for found in commands() if found.id.startswith("README")):
+        module = shown.split()[2].removeprefix("vertiwm_jax.")
+        words = f"{module} {shown.split()[3]}" if module == "evaluate" else module
+        whole = any(word in shown for word in ("--help", "--resume", "--config"))
+        line = shown if whole else f"{shown} {SHORTENED[words]}"
+        if "<date>" in line:
+            line = line.replace("ppo-<date>-<time>", min(Path("runs").glob("ppo-*")).name)
+        done.append(subprocess.run([sys.executable, *shlex.split(line)[1:]], env=env))
+        assert done[-1].returncode == 0, line
+    assert len(done) > 12
 
 
 class Understood(Exception):

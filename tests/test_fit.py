@@ -1,5 +1,6 @@
 """`python -m vertiwm_jax.fit` from end to end, on settings so small that compiling is its cost."""
 
+import itertools
 import shutil
 from pathlib import Path
 
@@ -133,6 +134,27 @@ def test_specialists_may_share_the_encoders_of_one(run, fitted):
     chex.assert_trees_all_equal(params.transformer, before.transformer)
 
 
+def test_gates_are_added_to_specialists_that_stay_as_they_are(run, fitted, folder):
+    further = fitted(
+        *("--start", str(run / "model"), "--model.gates", "2"),
+        *("--nesam.rollouts.updates", "0", "--transformer.rollouts.updates", "0"),
+    )
+    stages = {path.name for path in further.iterdir() if path.is_dir()}
+    assert stages == {"gate", "gate_1", "model"}
+    (_, before), (config, after) = (model.load(place / "model") for place in (run, further))
+    assert config.gates == len(after.gate) == 2
+    chex.assert_trees_all_equal(
+        (after.nesam, after.transformer, after.gate.scale),
+        (before.nesam, before.transformer, before.gate.scale),
+    )
+    gates = before.gate, *map(after.gate.only, (0, 1))
+    for one, other in itertools.combinations(gates, 2):
+        pairs = zip(*map(jax.tree.leaves, (one.network, other.network)), strict=True)
+        assert any(not np.array_equal(x, y) for x, y in pairs)
+    message = refusal(fit.main, "--config", folder / "tiny.yaml", "--start", further / "model")
+    assert "gates=1" in message and "gates=2" in message
+
+
 def test_a_fit_goes_on_from_a_model_with_more_drives(run, fitted, folder, tmp_path):
     (tmp_path / "more").mkdir()
     shutil.copy(folder / "drives" / "rigid" / "world.npz", tmp_path / "more" / "driven.npz")
@@ -179,6 +201,7 @@ def test_one_specialist_alone_is_fitted_and_compared(fitted, folder, tmp_path, c
         ({"parts": ("gate", "nesam")}, "both specialists"),
         ({"terrain": "none"}, "patches for the gate"),
         ({"parts": ("nesam",), "encoders": "shared"}, "own ones for nesam alone"),
+        ({"gates": 0}, "gates: expected at least 1"),
     ],
 )
 def test_models_without_sense_are_refused(settings, words):
@@ -190,6 +213,9 @@ def test_what_cannot_be_fitted_is_named(run, folder, tmp_path, capsys):
     with pytest.raises(SystemExit, match="2"):
         fit.main(["--model.encoders", "shared", "--nesam.learns-from", "rigid"])
     assert "model.encoders: expected own ones" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        fit.main(["--model.gates", "2", "--gate.rollouts.trainable", "gate.network", "nesam"])
+    assert "expected nothing but gates where there are 2" in capsys.readouterr().err
     message = refusal(fit.main, "--data", tmp_path, "--runs", tmp_path / "runs")
     assert "expected files of drives, or folders of them named rigid" in message
     again = shutil.copytree(run, tmp_path / "again")

@@ -10,10 +10,11 @@ from vertiwm_jax.fit import FitConfig
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.ppo import PPOTraining
+from vertiwm_jax.world_model import model
 
 FOLDER = Path(__file__).parents[1] / "configs"
 KINDS = {"table3": CompareConfig, "import_nedm": ImportSettings} | dict.fromkeys(
-    ["fit_chrono", "fit_paper", "fine_tune"], FitConfig
+    ["fit_chrono", "fit_paper", "fine_tune", "gates"], FitConfig
 )
 
 
@@ -23,6 +24,13 @@ def test_every_one_can_be_read(file):
     kind = folders.get(file.parent.name, KINDS.get(file.stem))
     loaded = config.load(kind, file) if kind else evaluate.training(file)
     assert kind or loaded.name in file.stem
+
+
+@pytest.mark.parametrize("name", ["fine_tune", "gates"])
+def test_what_goes_on_from_the_model_that_comes_along_is_of_its_form(name):
+    settings = config.load(FitConfig, FOLDER / f"{name}.yaml")
+    assert settings.start == Path("pretrained")
+    assert settings.model == model.load(model.PRETRAINED)[0]
 
 
 def test_the_papers_schedule_is_the_papers():

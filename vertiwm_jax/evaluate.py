@@ -120,7 +120,7 @@ class Adaptation:
 
 @dataclass(frozen=True)
 class Calibration:
-    """How far off predictions of Verti-WM are, by how much its specialists disagree.
+    """How far off predictions of Verti-WM are, by how much its gates or specialists disagree.
 
     Bounds on the error are found from the validation drives, and tried on the test drives.
     """
@@ -253,20 +253,23 @@ def _calibrate(command: Calibration) -> None:
             for split in ("validation", "test")
         )
         model = choose("vertiwm", command.weights)
-        before, found = (calibration.signs(*model, test) for test in (measured, tested))
+        before, known = calibration.signs(*model, measured)
+        error, found = calibration.signs(*model, tested)
     except ValueError as error:  # what is wrong with drives, maps, or predictions
         sys.exit(f"error: {error}")
-    bounds = {
-        "disagreement": calibration.Calibration.measure(*before),
-        "nothing": calibration.Calibration.measure(before[0], None),
+    measure = calibration.Calibration.measure
+    bounds = {name: measure(before, each) for name, each in known.items()}
+    nothing, (best, order) = measure(before, None), next(iter(found.items()))
+    rows = {
+        name: calibration.coverage(each, error, found[name], order) for name, each in bounds.items()
     }
-    rows = {name: calibration.coverage(each, *found) for name, each in bounds.items()}
-    tables = [calibration.format_parts(*found), calibration.format_coverage(rows)]
+    rows["nothing"] = calibration.coverage(nothing, error, order, order)
+    tables = [calibration.format_parts(error, order), calibration.format_coverage(rows)]
     print("\n" + "\n\n".join(tables))
     if command.output:
         command.output.mkdir(parents=True, exist_ok=True)
         runs.write_atomic(command.output / "calibration.md", "\n\n".join(tables) + "\n")
-        figure = calibration.picture(bounds["disagreement"], *found, bounds["nothing"])
+        figure = calibration.picture(bounds[best], error, order, nothing)
         plots.save(figure, command.output / "calibration.png")
 
 

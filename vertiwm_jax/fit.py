@@ -1,7 +1,7 @@
 """`python -m vertiwm_jax.fit`: fit Verti-WM to recorded drives, all stages of it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
@@ -16,8 +16,8 @@ from vertiwm_jax.training import failures_in_one_line, keep_compiled
 from vertiwm_jax.world_model import model
 from vertiwm_jax.world_model.model import VertiWMParams
 
-ROLLOUTS = ("nesam_rollouts", "transformer_rollouts", "gate")
-"""Stages that are drawn."""
+ROLLOUTS = ("nesam_rollouts", "transformer_rollouts", "gate*")
+"""Stages that are drawn, of all gates."""
 CURVES = {
     "loss": "loss",
     "error_rigid": "error on rigid ground [m]",
@@ -46,7 +46,7 @@ class FitConfig(PipelineConfig):
     """Folders of earlier runs, whose stages are taken over where their inputs are the same."""
     start: Path | None = None
     """Folder of a fitted model to go on from, or `pretrained`: it is fitted further by open-loop
-    predictions; its encoders and constants stay."""
+    predictions; its encoders and constants stay. It may have fewer gates than `model.gates`."""
     wandb: str | None = None
     """Project of Weights & Biases that gets the metrics too; needs the package `wandb`."""
     compile_cache: Path | None = None
@@ -80,14 +80,14 @@ def _start(config: FitConfig) -> VertiWMParams | None:
         return None
     pretrained = config.start == Path("pretrained")
     found, params = model.load(model.PRETRAINED if pretrained else config.start)
-    if found != config.model:
+    if found.gates > config.model.gates or replace(found, gates=config.model.gates) != config.model:
         raise ValueError(f"{config.start}: expected {config.model}, found {found}")
     return params
 
 
 def _draw(run: Run) -> None:
     """Losses and errors on validation drives of the stages that learn from rollouts."""
-    stages = [name for name in ROLLOUTS if (run.folder / name).is_dir()]
+    stages = [found.name for name in ROLLOUTS for found in sorted(run.folder.glob(name))]
     curves = {name: runs.read_columns(run.folder / name) for name in stages}
     figure = plots.learning_curves(curves, "updates", CURVES, "updates")
     plots.save(figure, run.folder / "learning_curves.png")

@@ -4,6 +4,7 @@ from dataclasses import fields
 from types import SimpleNamespace
 from typing import Any, NamedTuple, Self
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import torch
@@ -32,6 +33,7 @@ class History(NamedTuple):
 
     nesam: of `[2 B]` tokens, those of all vehicles and then those of their mirror images.
     expected: `[B, 12]` what physics alone had made of the current state.
+    hidden: `[G, B, 64]` of the gates.
     latent: `[B, 36, 16, 16]` the ground at the current state.
     """
 
@@ -57,7 +59,9 @@ class TorchVertiWM(nn.Module):
         self.semantic = Encoder(transformer.encoders.semantic["params"])
         self.transformer = SpecialistNetwork(transformer.network["params"], size)
         self.nesam = SpecialistNetwork(nesam.network["params"], size)
-        self.gate = Gate(params.gate.network["params"])
+        alone = (params.gate.only(number).network for number in range(len(params.gate)))
+        weights = (jax.tree.map(lambda x: x[0], network["params"]) for network in alone)
+        self.gates = nn.ModuleList(map(Gate, weights))
         self.gate_mean, self.gate_scale = tensor(params.gate.mean), tensor(params.gate.scale)
         self.normalisation = constants(transformer.normalisation)
         self.deviations = constants(nesam.normalisation)
@@ -81,7 +85,7 @@ class TorchVertiWM(nn.Module):
             nesam=self.nesam.empty_cache(2 * batch),
             memory=self.simulator.init(ground, state),
             expected=state.clone(),
-            hidden=torch.zeros(batch, HIDDEN),
+            hidden=torch.zeros(len(self.gates), batch, HIDDEN),
             latent=self.look(ground, state),
         )
 
@@ -158,13 +162,15 @@ class TorchVertiWM(nn.Module):
     def fuse(
         self, history: History, state: Tensor, command: Tensor, first: Tensor, second: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The next state `[B, 12]` from the Transformer's and NeSAM's, and the gate's memory."""
+        """The next state `[B, 12]` from the Transformer's and NeSAM's, and the gates' memory."""
         by_first, by_second = motion.increment(state, first), motion.increment(state, second)
         apart, seen = by_second - by_first, history.latent.mean((-2, -1))
         context = torch.cat([seen, state, command, by_second, by_first, apart], dim=-1)
-        outputs, hidden = self.gate((context - self.gate_mean) * self.gate_scale, history.hidden)
+        seen = (context - self.gate_mean) * self.gate_scale
+        each = [gate(seen, hidden) for gate, hidden in zip(self.gates, history.hidden, strict=True)]
+        outputs, hidden = (torch.stack(found) for found in zip(*each, strict=True))
         # Planar and vertical motion, tilt and yaw share a coefficient each.
-        beta = (0.5 + 1.5 * torch.tanh(outputs))[:, _GROUPS]
+        beta = (0.5 + 1.5 * torch.tanh(outputs)).mean(0)[:, _GROUPS]
         twist = first[:, 6:] + beta * (second[:, 6:] - first[:, 6:])
         return motion.moved(state, by_first + beta * apart, twist), hidden
 

@@ -1,6 +1,6 @@
 """Bounds on errors, on errors whose size is known, and on predictions whose errors are."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +24,8 @@ def errors(seed, count=40_000):
 def test_bounds_hold_as_often_as_they_say_at_every_disagreement():
     found = Calibration.measure(*errors(0))
     assert (found.intercept, found.slope) == pytest.approx((0.02, 4.0), rel=0.25)
-    for row in calibration.coverage(found, *errors(1)):
+    error, disagreement = errors(1)
+    for row in calibration.coverage(found, error, disagreement, disagreement):
         np.testing.assert_allclose(row.parts, row.level, atol=0.05)
         assert row.held == pytest.approx(row.level, abs=0.02)
 
@@ -39,7 +40,8 @@ def test_the_quantiles_of_exponential_errors():
 def test_one_bound_for_all_holds_too_often_where_there_is_least_disagreement():
     error, _ = errors(0)
     found = Calibration.measure(error, None)
-    for row in calibration.coverage(found, *errors(1)):
+    error, disagreement = errors(1)
+    for row in calibration.coverage(found, error, disagreement, disagreement):
         assert row.held == pytest.approx(row.level, abs=0.02)
         assert row.parts[0] > row.level > row.parts[-1]
 
@@ -64,23 +66,38 @@ def test_the_picture_has_every_bound_and_how_often_it_held():
     assert np.max(level - share) > 0.12
 
 
+def test_parts_can_be_ordered_by_something_else():
+    error, disagreement = errors(0)
+    found = Calibration.measure(error, disagreement)
+    ordered = calibration.coverage(found, error, disagreement, order=error)
+    assert ordered[1].parts[0] == 1.0 and ordered[1].parts[-1] < 0.5
+    assert ordered[1].held == pytest.approx(0.8, abs=0.01)
+
+
 @struct.dataclass
 class Step:
     count: object
     disagreement: object
+    spread: object
 
 
+@dataclass(frozen=True)
 class Standing:
-    """Never moves, and disagrees with itself in the fifth step alone."""
+    """Never moves; its specialists disagree in the fifth step and after, its gates by half of it.
+
+    gates: whether there are several.
+    """
+
+    gates: bool = True
 
     def init(self, params, terrain, state):
-        return Step(jnp.int32(0), jnp.float32(0))
+        return Step(jnp.int32(0), jnp.float32(0), jnp.float32(0))
 
     def step(self, params, terrain, history, state, command):
         count = history.count + 1
-        apart = jnp.where(count == 5, params, jnp.float32(0))
+        apart = jnp.where(count >= 5, params, jnp.float32(0))
         state = replace(state, position=state.position + 0 * params)
-        return state, Step(count, apart)
+        return state, Step(count, apart, apart / 2 if self.gates else jnp.float32(0))
 
 
 def standing(windows=3, context=2, horizon=4):
@@ -94,10 +111,18 @@ def standing(windows=3, context=2, horizon=4):
     return TestWindows(Windows(*arrays, context), none, ground)
 
 
-def test_errors_and_the_largest_disagreement_are_those_of_the_predicted_steps():
-    error, largest = calibration.signs(Standing(), jnp.float32(0.25), standing())
+def test_errors_and_disagreement_are_those_of_the_predicted_steps():
+    """Two of the context, and four predicted, in the last two of which they disagree."""
+    error, found = calibration.signs(Standing(), jnp.float32(0.25), standing())
     np.testing.assert_allclose(error, [1, 2, 3], rtol=1e-6)
-    np.testing.assert_allclose(largest, 0.25)
+    assert list(found) == ["gates", "specialists"]
+    np.testing.assert_allclose(found["gates"], 0.25)
+    np.testing.assert_allclose(found["specialists"], 0.5)
+
+
+def test_a_single_gate_tells_nothing():
+    _, found = calibration.signs(Standing(gates=False), jnp.float32(0.25), standing())
+    assert list(found) == ["specialists"]
 
 
 def test_a_prediction_that_is_not_finite_is_an_error():

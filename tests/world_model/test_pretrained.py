@@ -48,7 +48,7 @@ def test_it_predicts_better_than_what_it_is_made_of(windows):
 
 def test_its_weights_are_finite_and_few():
     _, params = VertiWM.pretrained()
-    assert sum(x.size for x in jax.tree.leaves(params.gate.network)) == 33_764
+    assert sum(x.size for x in jax.tree.leaves(params.gate.network)) == 4 * 33_764
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(params))
     assert {x.dtype for x in jax.tree.leaves(params)} == {jnp.dtype("float32")}
     assert sum(x.size for x in jax.tree.leaves(params)) * 4 < 10e6

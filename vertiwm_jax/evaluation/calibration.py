@@ -1,9 +1,10 @@
-"""Whether disagreement of the specialists tells how far off a prediction is, in metres.
+"""Whether what a model is made of, by disagreeing, tells how far off a prediction is, in metres.
 
-Where two models that fail for different reasons disagree, one of them is wrong at least
-(Lakshminarayanan et al., 2017, of ensembles). How far off both are, recorded drives have to tell:
-the scale and the quantiles are measured on some drives, and checked on others, as in split
-conformal prediction with normalised scores (Lei et al., 2018).
+Where models that fail for different reasons disagree, one of them is wrong at least
+(Lakshminarayanan et al., 2017, of ensembles): the two specialists, or several gates about where
+between these the vehicle goes. How far off it is then, recorded drives have to tell: the scale and
+the quantiles are measured on some drives, and checked on others, as in split conformal prediction
+with normalised scores (Lei et al., 2018).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 """Shares of predictions that a bound is to hold for."""
 PARTS = 5
-"""Equal parts of the windows, by how much the specialists disagree, that are looked at apart."""
+"""Equal parts of the windows, by disagreement, that are looked at apart."""
 _LEAST = 1e-3  # m, of a scale
 
 
@@ -37,7 +38,7 @@ _LEAST = 1e-3  # m, of a scale
 class Calibration:
     """A bound on an error e for each level: quantile(level) of e / scale, times the scale.
 
-    intercept, slope: of the scale, m and m per m, over the largest disagreement of a prediction.
+    intercept, slope: of the scale, m and m per m, over the disagreement in a prediction.
     scores: errors over their scales, of the drives that it was measured on, in order.
     """
 
@@ -78,38 +79,47 @@ class Coverage:
     mean_bound: float
 
 
-def signs(model: Dynamics, params: Params, test: TestWindows) -> tuple[np.ndarray, np.ndarray]:
-    """Position error after the last step, and the largest disagreement before: `[N]` each, m.
+def signs(
+    model: Dynamics, params: Params, test: TestWindows
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Position error after the last step, and how much was disagreed before it: `[N]` each, m.
 
-    Of a model whose history holds its disagreement, as Verti-WM's does. `ValueError` if a
-    prediction is not finite.
+    Disagreement is that of the "gates", if there are several, and of the "specialists", the most
+    telling first, summed over the predicted steps; the history of the model has to hold both, as
+    Verti-WM's does. `ValueError` if a prediction is not finite.
     """
-    last, largest = _rolled(model, params, test.terrain, test.windows)
-    error = np.linalg.norm(np.asarray(last - test.windows.state[:, -1, :3]), axis=-1)
+    last, apart, spread = map(np.asarray, _rolled(model, params, test.terrain, test.windows))
+    error = np.linalg.norm(last - np.asarray(test.windows.state[:, -1, :3]), axis=-1)
     if lost := int(np.sum(~np.isfinite(error))):
         raise ValueError(f"expected finite predictions, found {lost} of {len(error)} that are not")
-    return error, np.asarray(largest)
+    several = {"gates": spread} if np.any(spread) else {}
+    return error, several | {"specialists": apart}
 
 
 @partial(jax.jit, static_argnames="model")
 def _rolled(
     model: Dynamics, params: Params, terrain: TerrainMap, windows: Windows
-) -> tuple[jax.Array, jax.Array]:
-    """Last positions `[N, 3]` and largest disagreements `[N]`, m."""
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Last positions `[N, 3]`, and sums of disagreement and spread `[N]`, m."""
 
-    def one(window: Windows) -> tuple[jax.Array, jax.Array]:
+    def one(window: Windows) -> tuple[jax.Array, jax.Array, jax.Array]:
         ground = terrain.select(window.world)
-        states, apart = open_loop(model, params, ground, window, lambda h: h.disagreement)
-        return states.position[-1], apart.max()
+        states, (apart, spread) = open_loop(
+            model, params, ground, window, lambda h: (h.disagreement, h.spread)
+        )
+        return states.position[-1], apart.sum(), spread.sum()
 
     return jax.lax.map(one, windows, batch_size=BATCH)
 
 
 def coverage(
-    calibration: Calibration, error: np.ndarray, disagreement: np.ndarray
+    calibration: Calibration, error: np.ndarray, disagreement: np.ndarray, order: np.ndarray
 ) -> list[Coverage]:
-    """How often its bounds held for errors `[N]`, m, of predictions with disagreements `[N]`, m."""
-    parts, rows = _parts(disagreement), []
+    """How often its bounds held for errors `[N]`, m, of predictions with disagreements `[N]`, m.
+
+    order: `[N]` what the parts are ordered by.
+    """
+    parts, rows = _parts(order), []
     for level in LEVELS:
         bound = calibration.bound(disagreement, level)
         held = error <= bound
@@ -122,7 +132,7 @@ def format_parts(error: np.ndarray, disagreement: np.ndarray) -> str:
     """A Markdown table of errors `[N]` by disagreements `[N]`, m."""
     parts = _parts(disagreement)
     rows = {
-        "largest disagreement in a step, m": [disagreement[part].mean() for part in parts],
+        "disagreement, mm": [1000 * disagreement[part].mean() for part in parts],
         "mean error, m": [error[part].mean() for part in parts],
         "95 % of errors below, m": [np.quantile(error[part], 0.95) for part in parts],
     }
@@ -162,7 +172,7 @@ def picture(
             colour, dash = line(i)
             bounds = calibration.bound(ordered, level)
             left.plot(ordered, bounds, dash, color=colour, label=f"bound for {level:.0%}")
-        left.set(xlabel="largest disagreement in a step [m]", ylabel="position error [m]")
+        left.set(xlabel="disagreement [m]", ylabel="position error [m]")
         left.set(xscale="log", yscale="log", ylim=(np.quantile(error, 0.005), None))
         for i, (name, bounds) in enumerate({"": calibration, "not ": constant}.items()):
             colour, _ = line(i)

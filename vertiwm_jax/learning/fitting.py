@@ -50,7 +50,7 @@ class FitConfig:
     """How parameters are fitted."""
 
     updates: int = 10_000
-    """Optimiser steps (AdamW), each on a batch, or batches, of its own."""
+    """Optimiser steps (AdamW), each on a batch, or batches, of its own; 0 leaves the fit out."""
     updates_per_iteration: int = 100
     """Updates between two validations, in one compiled call."""
     accumulate: int = 1
@@ -69,15 +69,15 @@ class FitConfig:
     """What is kept of the training."""
 
     def __post_init__(self):
-        for name in ("updates", "updates_per_iteration", "accumulate"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
+        for name, least in {"updates": 0, "updates_per_iteration": 1, "accumulate": 1}.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, found {getattr(self, name)}")
         if self.updates % self.updates_per_iteration:
             raise ValueError(
                 f"updates: expected a multiple of updates_per_iteration, "
                 f"{self.updates_per_iteration}, found {self.updates}"
             )
-        if not 0 <= self.warm_up < self.updates:
+        if self.updates and not 0 <= self.warm_up < self.updates:
             raise ValueError(
                 f"warm_up: expected 0 to {self.updates - 1} updates, found {self.warm_up}"
             )

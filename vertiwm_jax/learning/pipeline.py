@@ -99,6 +99,12 @@ class PipelineConfig:
                 f"model.encoders: expected own ones for specialists that learn from different "
                 f"collections, {kinds[0]} and {kinds[1]}, found shared"
             )
+        learned = self.gate.rollouts.trainable or ("all",)
+        if self.model.gates > 1 and any(name.split(".")[0] != "gate" for name in learned):
+            raise ValueError(
+                f"gate.rollouts.trainable: expected nothing but gates where there are "
+                f"{self.model.gates}, found {', '.join(learned)}"
+            )
 
     @property
     def driven(self) -> VehicleConfig | None:
@@ -133,7 +139,7 @@ def fit(
         physics = chrono_like(driven.vehicle if driven else hmmwv())
         params = built.init_params(key, physics, constants)
     else:
-        params = start
+        params = built.with_gates(start, key)
     if "nesam" in parts:
         second, digest = pipeline.specialist("nesam", built.nesam, params.nesam, config.nesam)
         params = replace(params, nesam=second)
@@ -207,7 +213,7 @@ class _Pipeline:
     def gate(
         self, verti_wm: VertiWM, params: VertiWMParams, before: Sequence[str]
     ) -> VertiWMParams:
-        """The gate between two specialists, whose digests are given."""
+        """The gates between two specialists, whose digests are given."""
         config = self.config.gate
         drives = self._drives(config.learns_from)
         if self.start is None:
@@ -215,8 +221,14 @@ class _Pipeline:
         objective = OpenLoop(verti_wm, self.config.loss, operator.attrgetter("coefficients"))
         problem = WindowProblem(verti_wm, objective, self.config.windows)
         data = cache(lambda: WindowData.of(self.config.windows, *drives()))
-        stage = "gate", problem, config.rollouts, config.learns_from
-        return self._fit(*stage, params, data, before)[0]
+        schedule = problem, config.rollouts, config.learns_from
+        fitted: list[VertiWMParams] = []
+        for number in range(len(params.gate)):
+            alone = replace(params, gate=params.gate.only(number))
+            name = f"gate_{number}" if number else "gate"
+            fitted.append(self._fit(name, *schedule, alone, data, before)[0])
+        first, *others = fitted
+        return replace(first, gate=first.gate.beside(*(each.gate for each in others)))
 
     def _fit(
         self,

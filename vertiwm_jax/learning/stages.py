@@ -68,8 +68,10 @@ def fit(
 
     One that has ended with the same inputs is not repeated, whether there or in the folder of one
     of the runs in `reuse`; one that has begun with them goes on from its newest checkpoint; one
-    with other inputs is thrown away.
+    with other inputs is thrown away. One of no updates is left out.
     """
+    if not inputs.config.updates:
+        return params
     folder = run.folder / name
     if folder.exists() and not _is_of(folder, inputs):
         print(f"\n{name}: its inputs have changed, it begins anew", flush=True)

@@ -37,16 +37,30 @@ _GATE = Gate()
 
 @struct.dataclass
 class GateParams:
-    """The gate, and constants that bring its context to unit size: it reads (c - mean) scale.
+    """G gates, and constants that bring their context to unit size: they read (c - mean) scale.
 
-    A component of scale 0 is left out. Zero mean and unit scale everywhere are the paper's.
+    A component of scale 0 is left out. Zero mean and unit scale everywhere are the paper's, and so
+    is a single gate.
 
-    network: of `networks.Gate`; mean, scale: `[C]`.
+    network: of `networks.Gate`, leaves `[G, ...]`; mean, scale: `[C]`.
     """
 
     network: Any
     mean: jax.Array
     scale: jax.Array
+
+    def __len__(self) -> int:
+        """G."""
+        return len(jax.tree.leaves(self.network)[0])
+
+    def only(self, number: int) -> Self:
+        """One of them."""
+        return replace(self, network=jax.tree.map(lambda x: x[number : number + 1], self.network))
+
+    def beside(self, *others: "GateParams") -> Self:
+        """These and others, with the constants of these."""
+        networks = [gates.network for gates in (self, *others)]
+        return replace(self, network=jax.tree.map(lambda *x: jnp.concatenate(x), *networks))
 
 
 @struct.dataclass
@@ -62,10 +76,12 @@ class VertiWMParams:
 class VertiWMHistory:
     """h of both specialists and the gate.
 
-    hidden: `[64]` of the gate; zeros where a window of prediction starts, in the paper.
+    hidden: `[G, 64]` of the gates; zeros where a window of prediction starts, in the paper.
     coefficients: `[4]` alpha that led to the current state; 0.5 before the first step.
     disagreement: `[]` m between where the two would have moved it, without a gradient; 0 before
         the first step.
+    spread: `[]` m, the standard deviation of where each gate by itself would have moved it, without
+        a gradient; 0 before the first step, and of a single gate.
     """
 
     transformer: History
@@ -73,6 +89,7 @@ class VertiWMHistory:
     hidden: jax.Array
     coefficients: jax.Array
     disagreement: jax.Array
+    spread: jax.Array
 
     @property
     def perception(self) -> Perception:
@@ -99,6 +116,9 @@ class ModelConfig:
     """What the gate reads of the ground."""
     coefficients: Literal["grouped", "scalar"] = "grouped"
     """Fusion coefficients for four groups of motion, or one for all."""
+    gates: int = 1
+    """Gates that are learned one after the other, from other first weights and other batches; the
+    mean of their coefficients fuses, and where they differ the model is not sure of itself."""
 
     def __post_init__(self):
         if not self.parts:
@@ -109,6 +129,8 @@ class ModelConfig:
             raise ValueError(f"terrain: expected patches for the gate, found {self.terrain!r}")
         if self.encoders == "shared" and not {"transformer", "nesam"} <= set(self.parts):
             raise ValueError(f"encoders: expected own ones for {self.parts[0]} alone, found shared")
+        if self.gates < 1:
+            raise ValueError(f"gates: expected at least 1, found {self.gates}")
 
     @property
     def transformer(self) -> TransformerSpecialist:
@@ -138,7 +160,16 @@ class ModelConfig:
             keys[0],
             self.transformer.init_params(keys[1], normalisation),
             self.nesam.init_params(keys[2], simulator, normalisation),
+            self.gates,
         )
+
+    def with_gates(self, params: VertiWMParams, key: jax.Array) -> VertiWMParams:
+        """Parameters with untrained gates added until there are as many as configured."""
+        more = self.gates - len(params.gate)
+        if more <= 0:
+            return params
+        new = self.build().init_params(key, params.transformer, params.nesam, more).gate
+        return replace(params, gate=params.gate.beside(new))
 
 
 @dataclass(frozen=True)
@@ -157,14 +188,17 @@ class VertiWM:
     gate_terrain: GateTerrain = "mean"
     coefficients: Literal["grouped", "scalar"] = "grouped"
 
-    def init_params(self, key: jax.Array, transformer: Params, nesam: Params) -> VertiWMParams:
-        """An untrained gate, which weighs both specialists equally, over their parameters.
+    def init_params(
+        self, key: jax.Array, transformer: Params, nesam: Params, gates: int = 1
+    ) -> VertiWMParams:
+        """Untrained gates, which weigh both specialists equally, over their parameters.
 
-        Place and heading are left out of its context, lest it learn maps by heart.
+        Place and heading are left out of their context, lest they learn maps by heart.
         """
         mean = jnp.zeros(CONTEXT_SIZE[self.gate_terrain])
         scale = jnp.ones_like(mean).at[jnp.array(POSITION_AND_YAW)].set(0.0)
-        network = _GATE.init(key, mean, jnp.zeros(HIDDEN))
+        keys = jax.random.split(key, gates)
+        network = jax.vmap(lambda key: _GATE.init(key, mean, jnp.zeros(HIDDEN)))(keys)
         return VertiWMParams(transformer, nesam, GateParams(network, mean, scale))
 
     @classmethod
@@ -176,13 +210,14 @@ class VertiWM:
     def init(
         self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState
     ) -> VertiWMHistory:
-        """Both specialists' histories, a gate without memory."""
+        """Both specialists' histories, gates without memory."""
         history = VertiWMHistory(
             self.transformer.init(params.transformer, terrain, state),
             self.nesam.init(params.nesam, terrain, state),
-            hidden=jnp.zeros(HIDDEN),
+            hidden=jnp.zeros((len(params.gate), HIDDEN)),
             coefficients=jnp.full(4, 0.5),
             disagreement=jnp.float32(0),
+            spread=jnp.float32(0),
         )
         return self._seeing(params, terrain, history, state)
 
@@ -197,10 +232,17 @@ class VertiWM:
         """Both specialists propose from the fused state, and see the next one."""
         first, second, following = self._propose(params, terrain, history, state, command)
         context = fusion.context(state, command, first, second, self.gate_terrain)
-        alpha, hidden = self.weigh(params.gate, context, history.hidden)
+        alphas, hidden = self.weigh(params.gate, context, history.hidden)
+        alpha = jnp.mean(alphas, axis=0)
+        apart, given = jax.lax.stop_gradient((second.increment - first.increment, alphas))
+        following = replace(
+            following,
+            hidden=hidden,
+            coefficients=alpha,
+            disagreement=jnp.linalg.norm(apart[:3]),
+            spread=jnp.linalg.norm((fusion.weights(jnp.std(given, axis=0)) * apart)[:3]),
+        )
         state = fusion.fuse(state, first, second, alpha)
-        apart = jnp.linalg.norm(jax.lax.stop_gradient(second.increment - first.increment)[:3])
-        following = replace(following, hidden=hidden, coefficients=alpha, disagreement=apart)
         return state, self._seeing(params, terrain, following, state)
 
     def context_along(
@@ -243,14 +285,17 @@ class VertiWM:
     def weigh(
         self, gate: GateParams, context: jax.Array, hidden: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """The coefficients `[4]` and the gate's next state (Eqs. 6, 7)."""
+        """The coefficients of each gate `[G, 4]`, and its next state `[G, 64]` (Eqs. 6, 7)."""
         mean, scale = jax.lax.stop_gradient((gate.mean, gate.scale))
+        seen = (context - mean) * scale
         outputs, hidden = cast(
             tuple[jax.Array, jax.Array],
-            _GATE.apply(gate.network, (context - mean) * scale, hidden),
+            jax.vmap(lambda network, hidden: _GATE.apply(network, seen, hidden))(
+                gate.network, hidden
+            ),
         )
         if self.coefficients == "scalar":
-            outputs = jnp.broadcast_to(jnp.mean(outputs), outputs.shape)
+            outputs = jnp.broadcast_to(jnp.mean(outputs, axis=-1, keepdims=True), outputs.shape)
         return fusion.coefficients(outputs), hidden
 
     def _seeing(
