@@ -254,22 +254,22 @@ def _calibrate(command: Calibration) -> None:
         )
         model = choose("vertiwm", command.weights)
         before, known = calibration.signs(*model, measured)
-        error, found = calibration.signs(*model, tested)
+        errors, found = calibration.signs(*model, tested)
     except ValueError as error:  # what is wrong with drives, maps, or predictions
         sys.exit(f"error: {error}")
-    measure = calibration.Calibration.measure
+    measure, (best, order) = calibration.Calibration.measure, next(iter(found.items()))
     bounds = {name: measure(before, each) for name, each in known.items()}
-    nothing, (best, order) = measure(before, None), next(iter(found.items()))
+    nothing = measure(before, None)
     rows = {
-        name: calibration.coverage(each, error, found[name], order) for name, each in bounds.items()
+        **{name: calibration.coverage(bounds[name], errors, found[name], order) for name in bounds},
+        "nothing": calibration.coverage(nothing, errors, order, order),
     }
-    rows["nothing"] = calibration.coverage(nothing, error, order, order)
-    tables = [calibration.format_parts(error, order), calibration.format_coverage(rows)]
+    tables = [calibration.format_parts(errors, order), calibration.format_coverage(rows)]
     print("\n" + "\n\n".join(tables))
     if command.output:
         command.output.mkdir(parents=True, exist_ok=True)
         runs.write_atomic(command.output / "calibration.md", "\n\n".join(tables) + "\n")
-        figure = calibration.picture(bounds[best], error, order, nothing)
+        figure = calibration.picture(bounds[best], errors, order, nothing)
         plots.save(figure, command.output / "calibration.png")
 
 
