@@ -198,7 +198,7 @@ def test_entries_that_do_not_exist_cannot_be_trained(new_run):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"updates": 0}, "updates: expected at least 1, found 0"),
+        ({"updates": -10}, "updates: expected at least 0, found -10"),
         ({"updates": 65}, "updates: expected a multiple of updates_per_iteration, 10, found 65"),
         ({"accumulate": 0}, "accumulate: expected at least 1, found 0"),
         ({"warm_up": 60}, "warm_up: expected 0 to 59 updates, found 60"),

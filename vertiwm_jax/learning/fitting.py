@@ -50,7 +50,7 @@ class FitConfig:
     """How parameters are fitted."""
 
     updates: int = 10_000
-    """Optimiser steps (AdamW), each on a batch, or batches, of its own; 0 leaves the fit out."""
+    """Optimiser steps (AdamW), each on a batch, or batches, of its own; 0 leaves the stage out."""
     updates_per_iteration: int = 100
     """Updates between two validations, in one compiled call."""
     accumulate: int = 1
