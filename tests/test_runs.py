@@ -2,6 +2,7 @@ import contextlib
 import json
 import os
 import resource
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -237,9 +238,16 @@ class Tracked(Settings):
     resume: Path | None = None
 
 
-def kept_offline(folder: Path) -> bytes:
-    """What Weights & Biases keeps in a folder until it has a network: records, not compressed."""
+def kept_offline(folder: Path, last: bytes) -> bytes:
+    """What Weights & Biases keeps in a folder until it has a network: records, not compressed.
+
+    A process of its own writes them, which may be a little behind: `last` is waited for.
+    """
     (file,) = folder.glob("wandb/offline-run-*/*.wandb")
+    for _ in range(200):
+        if last in file.read_bytes():
+            break
+        time.sleep(0.1)
     return file.read_bytes()
 
 
@@ -250,7 +258,7 @@ def test_metrics_also_go_to_a_named_project_of_weights_and_biases(tmp_path, monk
         run.log(10, {"episode_return": 1234.5})
         with run.part("gate", 0, Settings()) as part:
             part.log(1, {"gate_loss": 0.015625})
-    whole, of_part = kept_offline(run.folder), kept_offline(part.folder)
+    whole, of_part = kept_offline(run.folder, b"1234.5"), kept_offline(part.folder, b"0.015625")
     assert b"driving" in whole and b"driving" in of_part
     assert b"episode_return" in whole and b"1234.5" in whole and b"gate_loss" not in whole
     assert b"gate_loss" in of_part and b"0.015625" in of_part
