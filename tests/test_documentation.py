@@ -77,14 +77,15 @@ def commands():
 
 
 FEW = "{updates: 1, updates_per_iteration: 1, warm_up: 0}"
-SHORT = {
-    "policy.yaml": """
+TASK = """
 ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 2}
 navigation: {horizon_seconds: 3, settle_steps: 2}
 action_repeat: 2
-""",
-    "ppo.yaml": "ppo: {transitions: 64, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1}",
-    "sac.yaml": "sac: {transitions: 128, num_envs: 8, num_steps: 8, warm_up: 64, batch: 8}",
+"""
+SHORT = {
+    "ppo.yaml": TASK
+    + "ppo: {transitions: 64, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1}",
+    "sac.yaml": TASK + "sac: {transitions: 128, num_envs: 8, num_steps: 8, warm_up: 64, batch: 8}",
     "table.yaml": """
 rows: [{algorithm: ppo, model: builtin}]
 suites: [easy]
@@ -120,8 +121,7 @@ def test_the_commands_of_the_readme_one_after_the_other(tmp_path, monkeypatch):
     """Each in a folder of its own with what it names, shortened: 15 minutes."""
     monkeypatch.chdir(tmp_path)
     for name, settings in SHORT.items():
-        shared = SHORT["policy.yaml"] if name in ("ppo.yaml", "sac.yaml") else ""
-        Path(name).write_text(shared + settings)
+        Path(name).write_text(settings)
     shutil.copy("ppo.yaml", "my.yaml")
     (tmp_path / "data").symlink_to(ROOT / "data")
     (tmp_path / "MAPS").symlink_to(ROOT / "data" / "open" / "maps")

@@ -59,9 +59,11 @@ class TorchVertiWM(nn.Module):
         self.semantic = Encoder(transformer.encoders.semantic["params"])
         self.transformer = SpecialistNetwork(transformer.network["params"], size)
         self.nesam = SpecialistNetwork(nesam.network["params"], size)
-        alone = (params.gate.only(number).network for number in range(len(params.gate)))
-        weights = (jax.tree.map(lambda x: x[0], network["params"]) for network in alone)
-        self.gates = nn.ModuleList(map(Gate, weights))
+        gates = params.gate.network["params"]
+        self.gates = nn.ModuleList(
+            Gate(jax.tree.map(lambda x, number=number: x[number], gates))
+            for number in range(len(params.gate))
+        )
         self.gate_mean, self.gate_scale = tensor(params.gate.mean), tensor(params.gate.scale)
         self.normalisation = constants(transformer.normalisation)
         self.deviations = constants(nesam.normalisation)
