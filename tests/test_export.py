@@ -17,8 +17,7 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import export, runs
 from vertiwm_jax.deploy import onnx_graph, run_policy, stablehlo
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
-from vertiwm_jax.env import observation
-from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZE
 from vertiwm_jax.evaluation import navigation
@@ -29,6 +28,7 @@ from vertiwm_jax.rl.normalise import RunningStatistics
 from vertiwm_jax.sac import SACTraining
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.reveal import RevealConfig
 from vertiwm_jax.world_model import choice
 
 CONFIG = NavigationConfig(speed_range=(-1.0, 5.0))
@@ -132,7 +132,7 @@ def test_all_forms_of_a_policy_agree(actor, base, tmp_path):
 
 def test_observations_that_are_none_are_named(tmp_path):
     _, in_numpy = written(policy_of(ACTORS["ppo"], None), tmp_path)
-    with pytest.raises(ValueError, match=r"expected \[\.\.\., 402\], found \(7,\)"):
+    with pytest.raises(ValueError, match=r"expected \[\.\.\., 475\], found \(7,\)"):
         in_numpy(np.zeros(7))
     with pytest.raises(ValueError, match="expected finite numbers"):
         in_numpy(np.full(OBSERVATION_SIZE, np.nan))
@@ -175,18 +175,25 @@ def test_the_observation_of_map_arrays(size, sighted):
     arrays = (terrain.elevation, terrain.semantic, terrain.friction, terrain.obstacles)
     state = VehicleState.from_vector(jnp.array([15, 1, 2, 0.1, -0.2, 0.7, 3, 0, 0, 0, 0, 0.1]))
     goal, action = jnp.array([20.0, 5.0, 1.0]), jnp.array([0.3, -0.4])
-    eyes = choice.eyes() if sighted else None
-    exported = jax.export.deserialize(bytearray(stablehlo.observe(Chassis(), eyes)))
-    arguments = (
-        *(x[0] for x in arrays),
-        terrain.origin,
-        terrain.resolution,
-        state.vector,
-        goal,
-        action,
+    eyes, config = choice.eyes() if sighted else None, NavigationConfig()
+    observe, find_way, find_none = (
+        jax.export.deserialize(bytearray(data)).call
+        for data in (
+            stablehlo.observe(config, eyes),
+            stablehlo.route(config),
+            stablehlo.route(NavigationConfig(reveal=RevealConfig(range=12.0))),
+        )
     )
+    arrays = (*(x[0] for x in arrays), terrain.origin, terrain.resolution)
+    worlds = jnp.zeros(1, jnp.int32)
+    routes = route.plan(config.route, terrain, config.chassis, worlds, goal[None, :2])
+    way = find_way(*arrays, goal)
+    np.testing.assert_allclose(way, routes.cost[0], rtol=1e-5)
+    straight = route.straight(config.route, terrain, goal[None, :2])
+    np.testing.assert_allclose(find_none(*arrays, goal), straight.cost[0], rtol=1e-6)
+    assert (way >= straight.cost[0] - 1e-3).all() and (way > 1.5 * straight.cost[0]).any()
     expected = jax.jit(observation.observe, static_argnums=1)(
-        terrain, Chassis(), state, goal, action
+        terrain, config.chassis, state, goal, routes, action
     )
     assert 0 < (observation.arcs_ahead(expected)[1] == 7.5).sum() < 72
     if eyes:
@@ -194,7 +201,8 @@ def test_the_observation_of_map_arrays(size, sighted):
             expected, jax.jit(lambda: eyes(terrain, state).latent)()
         )
         assert float(jnp.std(expected[OBSERVATION_SIZE:])) > 0.1
-    np.testing.assert_allclose(exported.call(*arguments), expected, atol=1e-5)
+    found = observe(*arrays, way, state.vector, goal, action)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -213,8 +221,8 @@ def test_a_run_is_exported_as_it_is_evaluated(run_and_policy, tmp_path, capsys):
     export.main([str(run), "--seed", "1", "--output", str(robot)])
     assert str(robot) in capsys.readouterr().out
     assert {path.name for path in robot.iterdir()} == {
-        "policy.json", "policy.npz", "policy.onnx", "policy.stablehlo", "observe.stablehlo",
-        "run_policy.py",
+        "policy.json", "policy.npz", "policy.onnx", "policy.stablehlo", "route.stablehlo",
+        "observe.stablehlo", "run_policy.py",
     }  # fmt: skip
     in_numpy, seen = run_policy.load(robot), observations()
     np.testing.assert_allclose(in_numpy(seen[:64]), act(policy, seen[:64]), atol=1e-5)

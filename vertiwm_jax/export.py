@@ -97,7 +97,8 @@ def files(
         "policy.onnx": record(partial(run_policy.act, about, weights), size, 2),
         # The key is not used: no learned policy is random.
         "policy.stablehlo": stablehlo.policy(lambda seen: policy(seen, jax.random.key(0)), size),
-        "observe.stablehlo": stablehlo.observe(config.chassis, eyes),
+        "route.stablehlo": stablehlo.route(config),
+        "observe.stablehlo": stablehlo.observe(config, eyes),
         "run_policy.py": Path(run_policy.__file__).read_bytes(),
     }
 

@@ -4,16 +4,24 @@ import numpy as np
 import pytest
 from env.worlds import GRASS, SNOW, hills
 
-from vertiwm_jax.env import observation
+from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env.route import RouteConfig
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import obstacles
 
 CHASSIS = Chassis()
-observe = jax.jit(observation.observe, static_argnums=1)
+ROUTE = RouteConfig()
 OBSTACLE = np.array([[9.0, 3.0, 4.0, 6.0, 2.0]], np.float32)
 CLASSES = slice(observation.GROUND.stop, None)
+
+
+@jax.jit
+def observe(terrain, vehicle, goal, action):
+    """What is seen where the way to the goal is straight."""
+    routes = route.straight(ROUTE, terrain, goal[None, :2])
+    return observation.observe(terrain, CHASSIS, vehicle, goal, routes, action)
 
 
 def vehicle(x, y, yaw):
@@ -34,7 +42,7 @@ def world(origin=None):
 
 def test_layout_and_units():
     goal, action = jnp.array([20.0, 1.0, 2.5]), jnp.array([0.5, -0.25])
-    seen = np.asarray(observe(world(), CHASSIS, vehicle(0.0, 1.0, 0.0), goal, action))
+    seen = np.asarray(observe(world(), vehicle(0.0, 1.0, 0.0), goal, action))
     assert seen.shape == (observation.OBSERVATION_SIZE,) and seen.dtype == np.float32
     motion = [0.1 / 0.5, -0.2 / 0.5, 3 / 5, 0.1 / 5, -0.2 / 5, 0.1, 0.2, 0.3]
     np.testing.assert_allclose(seen[:8], motion, rtol=1e-6)
@@ -52,7 +60,9 @@ def test_layout_and_units():
     assert named["goal bearing"] == pytest.approx([1.0, 0.0], abs=1e-6)
     assert named["last action"] == pytest.approx([0.5, -0.25])
     ahead = observation.arcs_ahead(jnp.asarray(seen))
-    for name, found in zip(("height", "crown", "rise", "bank", "twist"), ahead, strict=True):
+    for name, found in zip(
+        ("height", "crown", "rise", "bank", "twist", "route"), ahead, strict=True
+    ):
         np.testing.assert_array_equal(seen[layout[name].where][1:], found.ravel())
     classes = seen[CLASSES].reshape(-1, 2)
     np.testing.assert_array_equal(seen[layout["friction"].where], classes[:, 0])
@@ -82,12 +92,12 @@ def on_ground(height):
     terrain = terrain_map.build(
         height(*np.meshgrid(x, -x)), np.full((16, 16), GRASS), elevation_range=(-1000, 1000)
     )
-    seen = observe(terrain, CHASSIS, vehicle(0.0, 0.0, 0.4), jnp.ones(3), jnp.zeros(2))
-    return np.asarray(seen)[observation.GROUND].reshape(5, -1)
+    seen = observe(terrain, vehicle(0.0, 0.0, 0.4), jnp.ones(3), jnp.zeros(2))
+    return np.asarray(seen)[observation.GROUND].reshape(6, -1)
 
 
 def test_a_plane_rises_and_banks_and_nothing_else():
-    height, crown, rise, bank, twist = on_ground(lambda x, y: 0.2 * x + 0.1 * y)
+    height, crown, rise, bank, twist, _ = on_ground(lambda x, y: 0.2 * x + 0.1 * y)
     place, heading = observation.poses_ahead(CHASSIS)
     direction = heading + 0.4
     np.testing.assert_allclose(
@@ -112,35 +122,33 @@ def test_a_saddle_twists_and_a_hump_crowns():
     hump = on_ground(lambda x, y: -(x**2 + y**2) / 20)[:, 0]
     corner = (CHASSIS.wheelbase**2 + CHASSIS.track**2) / 4
     np.testing.assert_allclose(hump[1], corner / 20 / 0.2, atol=0.1)  # bilinear between metres
-    np.testing.assert_allclose(hump[2:], 0, atol=0.05)
+    np.testing.assert_allclose(hump[2:5], 0, atol=0.05)
 
 
 def test_the_goal_is_in_the_frame_of_the_vehicle():
     left = jnp.array([0.0, 30.0, 2.5])
-    seen = observe(world(), CHASSIS, vehicle(0.0, 0.0, jnp.pi / 6), left, jnp.zeros(2))
+    seen = observe(world(), vehicle(0.0, 0.0, jnp.pi / 6), left, jnp.zeros(2))
     expected = [0.6, np.cos(np.pi / 3), np.sin(np.pi / 3)]
     np.testing.assert_allclose(seen[observation.GOAL], expected, atol=1e-6)
 
 
 def test_moving_the_world_changes_nothing():
     goal, action = jnp.array([20.0, -7.0, 2.0]), jnp.zeros(2)
-    here = observe(world(), CHASSIS, vehicle(2.0, 1.0, 0.4), goal, action)
+    here = observe(world(), vehicle(2.0, 1.0, 0.4), goal, action)
     shift = jnp.array([32.0, -48.0, 0.0])
     moved_world = world(origin=(-64.0 + 32.0, 64.0 - 48.0))
     moved_world = moved_world.replace(
         obstacles=moved_world.obstacles + jnp.append(shift[:2], jnp.zeros(3))
     )
     moved = vehicle(2.0 + 32.0, 1.0 - 48.0, 0.4)
-    np.testing.assert_allclose(
-        observe(moved_world, CHASSIS, moved, goal + shift, action), here, atol=2e-5
-    )
+    np.testing.assert_allclose(observe(moved_world, moved, goal + shift, action), here, atol=2e-5)
 
 
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3])
 def test_turning_the_world_changes_nothing(quarter_turns):
     still = world()
     goal, action = jnp.array([20.0, -7.0, 2.0]), jnp.zeros(2)
-    here = observe(still, CHASSIS, vehicle(2.0, 1.0, 0.4), goal, action)
+    here = observe(still, vehicle(2.0, 1.0, 0.4), goal, action)
 
     def turn(x, y):
         for _ in range(quarter_turns):
@@ -158,19 +166,16 @@ def test_turning_the_world_changes_nothing(quarter_turns):
     )
     there = vehicle(*turn(2.0, 1.0), 0.4 + quarter_turns * jnp.pi / 2)
     turned_goal = jnp.array([*turn(20.0, -7.0), 2.0])
-    np.testing.assert_allclose(
-        observe(turned, CHASSIS, there, turned_goal, action), here, atol=2e-4
-    )
+    np.testing.assert_allclose(observe(turned, there, turned_goal, action), here, atol=2e-4)
 
 
 def test_obstacles_soil_and_the_edge_are_seen():
     terrain = world()
     goal = jnp.array([0.0, 30.0, 0.0])
     beside = vehicle(4.0, 3.0, 0.0)
-    seen = observe(terrain, CHASSIS, beside, goal, jnp.zeros(2))
+    seen = observe(terrain, beside, goal, jnp.zeros(2))
     bare = observe(
         terrain.replace(obstacles=jnp.zeros_like(terrain.obstacles)),
-        CHASSIS,
         beside,
         goal,
         jnp.zeros(2),
@@ -178,7 +183,7 @@ def test_obstacles_soil_and_the_edge_are_seen():
     change = np.stack(observation.arcs_ahead(seen)) - np.stack(observation.arcs_ahead(bare))
     wall = np.asarray(observation.arcs_ahead(seen)[1]) == 7.5
     np.testing.assert_array_equal((change != 0).any(axis=0), wall)
-    assert not change[[0, 2, 3, 4]].any()
+    assert not change[[0, 2, 3, 4, 5]].any()
     # A wall where the vehicle, and a margin of 0.3 m, would touch the obstacle.
     place, heading = observation.poses_ahead(CHASSIS)
     poses = place[1:] + np.array([4.0, 3.0]), jnp.asarray(heading[1:])
@@ -192,7 +197,7 @@ def test_obstacles_soil_and_the_edge_are_seen():
     np.testing.assert_allclose(friction[~snow], 0.36, rtol=1e-6)
     assert (friction[snow] == 0).all()
 
-    outward = observe(terrain, CHASSIS, vehicle(60.0, 0.0, 0.0), goal, jnp.zeros(2))
+    outward = observe(terrain, vehicle(60.0, 0.0, 0.0), goal, jnp.zeros(2))
     friction = np.asarray(outward)[CLASSES].reshape(-1, 2)[:, 0]
     assert (friction == -1).any() and (friction > 0).any()
 
@@ -210,7 +215,7 @@ def test_gradients_are_finite_at_the_goal():
 
     def total(position):
         moved = state.replace(position=position)
-        return observation.observe(terrain, CHASSIS, moved, state.position, jnp.zeros(2)).sum()
+        return observe(terrain, moved, state.position, jnp.zeros(2)).sum()
 
     assert jnp.isfinite(jax.jit(jax.grad(total))(state.position)).all()
 
@@ -218,7 +223,7 @@ def test_gradients_are_finite_at_the_goal():
 def test_each_arc_is_a_candidate_and_nothing_seen_is_lost():
     seen = jnp.arange(observation.OBSERVATION_SIZE, dtype=jnp.float32)
     arcs, rest = observation.ARCS.split(seen)
-    assert arcs.shape == (9, 41) and len(observation.ARCS.actions) == 9
+    assert arcs.shape == (9, 49) and len(observation.ARCS.actions) == 9
     np.testing.assert_allclose(arcs[:, -1], observation.ARC_STEERING)
     np.testing.assert_allclose([speed for speed, _ in observation.ARCS.actions], 0.0)
     np.testing.assert_allclose(
@@ -234,7 +239,7 @@ def test_the_edge_of_the_map_is_a_wall():
     terrain = world()
     edge = float(terrain.origin[0] + 128 * terrain.resolution)
     state = vehicle(edge - 5.0, 0.0, 0.0)
-    found = observe(terrain, CHASSIS, state, jnp.zeros(3), jnp.zeros(2))
+    found = observe(terrain, state, jnp.zeros(3), jnp.zeros(2))
     crown = np.ravel(observation.arcs_ahead(found)[1])
     outside = observation.poses_ahead(CHASSIS)[0][1:, 0] > 5.0
     np.testing.assert_allclose(crown[outside], 7.5, rtol=1e-6)

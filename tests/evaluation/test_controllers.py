@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from env.worlds import GRASS
 
+from vertiwm_jax.env import route
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.observation import observe
@@ -19,7 +20,8 @@ POLICY = LookAhead(CONFIG)
 def command(terrain, goal):
     """Speed and steering of a vehicle at (0, 0) that looks east."""
     at_rest = VehicleState(jnp.array([0.0, 0.0, 0.47]), *jnp.zeros((3, 3)))
-    return CONFIG.command(POLICY(observe(terrain, Chassis(), at_rest, goal, jnp.zeros(2))))
+    routes = route.straight(CONFIG.route, terrain, goal[None, :2])
+    return CONFIG.command(POLICY(observe(terrain, Chassis(), at_rest, goal, routes, jnp.zeros(2))))
 
 
 def ground(height):
@@ -37,11 +39,12 @@ def test_on_flat_ground_it_steers_to_the_goal(bearing):
     goal = 40 * jnp.array([jnp.cos(bearing), jnp.sin(bearing), 0.0])
     chosen = command(FLAT, goal)
     assert float(chosen.speed) == pytest.approx(POLICY.speed, rel=1e-5)
-    # The arc that turns by the bearing, as far as the wheels turn.
-    aimed = np.clip(
-        np.arctan(bearing / POLICY.turning), -CONFIG.steering_limit, CONFIG.steering_limit
-    )
-    assert float(chosen.steering) == pytest.approx(aimed, abs=0.1)
+    # The arc to the goal has a radius of 40 m / (2 sin bearing); behind, either side is far.
+    aimed = np.arctan(Chassis().wheelbase * np.sin(abs(bearing)) / 20)
+    if abs(bearing) < 2:
+        assert abs(float(chosen.steering)) == pytest.approx(aimed, abs=0.16)
+    else:
+        assert abs(float(chosen.steering)) > 0.05
     assert np.sign(np.round(chosen.steering, 4)) == np.sign(bearing)
 
 

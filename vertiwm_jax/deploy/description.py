@@ -10,6 +10,7 @@ import numpy as np
 
 import vertiwm_jax
 from vertiwm_jax.env import observation
+from vertiwm_jax.env.footprint import Difficulty
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, LAYOUT, Part
 from vertiwm_jax.evaluation.controllers import REFERENCE, LookAhead, StraightToGoal
@@ -82,7 +83,11 @@ def _part(part: Part) -> dict[str, Any]:
     return {"slice": where, "unit": part.unit, "scale": part.scale}
 
 
-def _numbers(base: Any) -> dict[str, float]:
+def _numbers(base: Any) -> dict[str, Any]:
     """The settings of a controller, but for the environment's."""
-    names = [field.name for field in dataclasses.fields(base) if field.name != "config"]
-    return {name: getattr(base, name) for name in names}
+    own = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
+    del own["config"]
+    return {
+        name: dataclasses.asdict(value) if isinstance(value, Difficulty) else value
+        for name, value in own.items()
+    }

@@ -92,9 +92,6 @@ class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
             return add(_OPERATORS[ufunc], *floats)
         if ufunc is np.square:
             return floats[0] * floats[0]
-        if ufunc is np.remainder:
-            value, divisor = floats
-            return value - divisor * add("Floor", value / divisor)
         if ufunc is np.arctan2:
             return self._arctan2(*floats)
         return NotImplemented

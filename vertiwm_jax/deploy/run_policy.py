@@ -72,9 +72,9 @@ def _learned(about: About, weights: Weights, observation: np.ndarray) -> np.ndar
     limit = about["network"]["normalised_limit"]
     seen = np.clip((observation - weights["mean"]) / weights["std"], -limit, limit)
     steering = _float32(about["arcs"]["steering"])[:, None]
-    ground = ("height", "crown", "rise", "bank", "twist")
+    ground = ("height", "crown", "rise", "bank", "twist", "route")
 
-    before, after = _slice(about, "height").start, _slice(about, "twist").stop
+    before, after = _slice(about, "height").start, _slice(about, "route").stop
     here = [_part(about, seen, name)[:, :1] for name in ground]
     classes = seen[:, after : _slice(about, "sinkage").stop]
     shown = [_compressed(about, weights, seen)] if about["network"]["embedding"] else []
@@ -109,24 +109,25 @@ def _compressed(about: About, weights: Weights, seen: np.ndarray) -> np.ndarray:
 
 
 def _look_ahead(about: About, observation: np.ndarray) -> np.ndarray:
-    """Steers along the arc that keeps level and leads to the goal."""
-    base, tolerated = about["base"], about["base"]["tolerated"]
-    crown, rise, bank, twist = (
-        _arcs(about, observation, name) for name in ("crown", "rise", "bank", "twist")
+    """Steers along the arc that keeps level and leads on to the goal."""
+    base, weight = about["base"], about["base"]["difficulty"]
+    crown, rise, bank, twist, route = (
+        _arcs(about, observation, name) for name in ("crown", "rise", "bank", "twist", "route")
     )
-    cost = (
-        base["bank"] * np.square(np.maximum(np.abs(bank) - tolerated, 0))
-        + base["rise"] * np.square(np.maximum(np.abs(rise) - tolerated, 0))
-        + base["twist"] * np.square(twist)
-        + base["crown"] * np.square(np.maximum(crown, 0))
+    hard = (
+        weight["bank"] * np.square(np.maximum(np.abs(bank) - weight["tolerated"], 0))
+        + weight["rise"] * np.square(np.maximum(np.abs(rise) - weight["tolerated"], 0))
+        + weight["twist"] * np.square(twist)
+        + weight["crown"] * np.square(np.maximum(crown, 0))
     )
     near_first = np.exp(-np.array(about["arcs"]["stations"]) / base["reach"])
-    cost = np.sum(cost * _float32(near_first), axis=2)
-    steering, limit = np.array(about["arcs"]["steering"]), about["action"]["steering_limit"]
-    turned = _float32(base["turning"] * np.tan(limit * steering))
-    off_goal = np.mod(_bearing(about, observation)[:, None] - turned + np.pi, 2 * np.pi) - np.pi
-    share = _softmax(-(cost + base["turn"] * np.square(off_goal)) / base["spread"], axis=1)
-    return _action(about, limit * np.sum(share * _float32(steering), axis=1))
+    cost = np.sum(hard * _float32(near_first), axis=2)
+    first, end = base["far"]
+    metres = about["observation"]["parts"]["route"]["scale"] / (end - first)
+    left = metres * np.sum(route[:, :, first:end], axis=2)
+    share = _softmax(-(cost + base["onward"] * left) / base["spread"], axis=1)
+    limit, steering = about["action"]["steering_limit"], _float32(about["arcs"]["steering"])
+    return _action(about, limit * np.sum(share * steering, axis=1))
 
 
 def _straight_to_goal(about: About, observation: np.ndarray) -> np.ndarray:

@@ -9,7 +9,10 @@ import jax.numpy as jnp
 from jax import export
 
 from vertiwm_jax.env import observation
+from vertiwm_jax.env import route as routes
 from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.route import Routes
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.classes import STANDARD
 from vertiwm_jax.terrain.map import ELEVATION_RANGE, TerrainMap
@@ -24,46 +27,52 @@ def policy(act: Callable[[jax.Array], jax.Array], size: int) -> bytes:
     return _serialised(act, _floats(batch, size))
 
 
-def observe(chassis: Chassis, eyes: Eyes | None) -> bytes:
+def route(config: NavigationConfig) -> bytes:
+    """The route to a goal over map arrays of any size; the arguments of `_route`."""
+    return _serialised(partial(_route, config), *_map_arrays(), _floats(3))
+
+
+def observe(config: NavigationConfig, eyes: Eyes | None) -> bytes:
     """`observation.observe` of map arrays, for maps of any size; the arguments of `_observe`.
 
     With eyes, the observation ends with what they see.
     """
-    rows, columns, cell_rows, cell_columns, boxes = export.symbolic_shape(
-        "rows, columns, cell_rows, cell_columns, boxes"
-    )
-    return _serialised(
-        partial(_observe, chassis, eyes),
-        _floats(rows, columns),
-        jax.ShapeDtypeStruct((cell_rows, cell_columns), jnp.uint8),
-        _floats(cell_rows, cell_columns),
-        _floats(boxes, 5),
-        _floats(2),
-        _floats(),
-        _floats(12),
-        _floats(3),
-        _floats(2),
-    )
+    seen = _floats(config.route.cells, config.route.cells), _floats(12), _floats(3), _floats(2)
+    return _serialised(partial(_observe, config.chassis, eyes), *_map_arrays(), *seen)
 
 
-def _observe(
-    chassis: Chassis,
-    eyes: Eyes | None,
+def _route(config: NavigationConfig, *arguments: jax.Array) -> jax.Array:
+    """`[n, n]` m to the goal `[3]`, which follows the arguments of `_terrain`."""
+    *arrays, goal = arguments
+    terrain = _terrain(*arrays)
+    if config.reveal.partial:
+        return routes.straight(config.route, terrain, goal[None, :2]).cost[0]
+    return routes.to_goal(config.route, terrain, config.chassis, goal[:2])
+
+
+def _observe(chassis: Chassis, eyes: Eyes | None, *arguments: jax.Array) -> jax.Array:
+    """`[O]` seen on one world, given by the arguments of `_terrain`; what follows them:
+
+    route: `[n, n]`, of `_route`; state: `[12]`, as `VehicleState.vector`; goal: `[3]` m; action:
+    `[2]` the last one.
+    """
+    *arrays, cost, state, goal, action = arguments
+    terrain, vehicle = _terrain(*arrays), VehicleState.from_vector(state)
+    route = Routes(cost[None], jnp.int32(0))
+    seen = observation.observe(terrain, chassis, vehicle, goal, route, action)
+    return observation.with_embedding(seen, eyes(terrain, vehicle).latent) if eyes else seen
+
+
+def _terrain(
     elevation: jax.Array,
     semantic: jax.Array,
     friction: jax.Array,
     obstacles: jax.Array,
     origin: jax.Array,
     resolution: jax.Array,
-    state: jax.Array,
-    goal: jax.Array,
-    action: jax.Array,
-) -> jax.Array:
-    """`[O]` seen on one world of the standard classes, whose arrays `TerrainMap` describes.
-
-    state: `[12]`, as `VehicleState.vector`; goal: `[3]` m; action: `[2]` the last one.
-    """
-    terrain = TerrainMap(
+) -> TerrainMap:
+    """One world of the standard classes, whose arrays `TerrainMap` describes."""
+    return TerrainMap(
         elevation=elevation[None],
         semantic=semantic[None],
         friction=friction[None],
@@ -77,9 +86,16 @@ def _observe(
         world=jnp.int32(0),
         class_names=STANDARD.names,
     )
-    vehicle = VehicleState.from_vector(state)
-    seen = observation.observe(terrain, chassis, vehicle, goal, action)
-    return observation.with_embedding(seen, eyes(terrain, vehicle).latent) if eyes else seen
+
+
+def _map_arrays() -> tuple[jax.ShapeDtypeStruct, ...]:
+    """The arguments of `_terrain`, for maps of any size."""
+    rows, columns, cell_rows, cell_columns, boxes = export.symbolic_shape(
+        "rows, columns, cell_rows, cell_columns, boxes"
+    )
+    classes = jax.ShapeDtypeStruct((cell_rows, cell_columns), jnp.uint8)
+    friction, obstacles = _floats(cell_rows, cell_columns), _floats(boxes, 5)
+    return _floats(rows, columns), classes, friction, obstacles, _floats(2), _floats()
 
 
 def _floats(*shape: Any) -> jax.ShapeDtypeStruct:

@@ -13,9 +13,10 @@ from gymnax.environments import environment, spaces
 
 from vertiwm_jax import devices
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE, Dynamics, History, Params, disagreement, embedding
-from vertiwm_jax.env import observation, tasks
+from vertiwm_jax.env import observation, route, tasks
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.reward import RewardConfig, reward
+from vertiwm_jax.env.route import RouteConfig, Routes
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending, edge_distance, first_ending, is_terminal
 from vertiwm_jax.env.variation import Variation, VariationConfig
@@ -44,6 +45,7 @@ class NavigationConfig:
     plausible_disagreement: m by which its parts may disagree in a step before it has diverged.
     settle_steps: steps of standing still before a start is handed out.
     embeddings: whether an observation ends with the ground as the model's encoders see it.
+    route: how the way to the goal is found; it is straight where the map is not all known.
     reveal: what sensors reveal of a map that is not known; by default all of it is.
     """
 
@@ -62,6 +64,7 @@ class NavigationConfig:
     embeddings: bool = False
     chassis: Chassis = dataclasses.field(default_factory=Chassis)
     reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
+    route: RouteConfig = RouteConfig()
     reveal: RevealConfig = RevealConfig()
 
     def __post_init__(self) -> None:
@@ -90,7 +93,7 @@ class NavigationState(environment.EnvState):
     """One episode under way.
 
     vehicle, history: the model's.
-    world: `[]` int32; goal: `[3]` m.
+    world: `[]` int32; goal: `[3]` m; route: `[]` int32, which of all routes leads there.
     action: `[2]` the last one, in [-1, 1].
     time: `[]` int32 steps done; stalled: `[]` int32 steps stalled without a break.
     ending: `[]` int32 `Ending` code.
@@ -102,6 +105,7 @@ class NavigationState(environment.EnvState):
     history: History
     world: jax.Array
     goal: jax.Array
+    route: jax.Array
     action: jax.Array
     stalled: jax.Array
     ending: jax.Array
@@ -114,13 +118,14 @@ class NavigationParams(environment.EnvParams):
     """What an environment is run with: arrays, so that nothing here is compiled in.
 
     dynamics: the model's parameters.
-    terrain: all worlds.
+    terrain: all worlds; routes: to all goals of the pool.
     starts, start_observation: leaves `[P, ...]` and `[P, O]`, the pool that resets draw from.
     max_steps_in_episode: `[]` int32.
     """
 
     dynamics: Params
     terrain: TerrainMap
+    routes: Routes
     starts: NavigationState
     start_observation: jax.Array
 
@@ -128,6 +133,11 @@ class NavigationParams(environment.EnvParams):
     def pool_size(self) -> int:
         """P, the number of starts."""
         return self.start_observation.shape[0]
+
+    def cost_to_go(self, state: NavigationState) -> jax.Array:
+        """`[]` m of level ground that the way to the goal costs from where the vehicle is."""
+        routes, position = self.routes.select(state.route), state.vehicle.position
+        return routes.cost_to_go(self.terrain, position[:2])
 
     def believed(self, state: NavigationState) -> TerrainMap:
         """The world of an episode as far as its vehicle has seen it: what may drive it by."""
@@ -168,8 +178,9 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
 
         Enough to restore what was learned with such parameters, without settling anything.
         """
-        starts, seen = jax.eval_shape(partial(_settle, self), dynamics, terrain, tasks)
-        return _params(self, dynamics, terrain, starts, seen)
+        routes = route.straight(self.config.route, terrain, tasks.goal)
+        starts, seen = jax.eval_shape(partial(_settle, self), dynamics, terrain, routes, tasks)
+        return _params(self, dynamics, terrain, routes, starts, seen)
 
     def start(
         self, params: NavigationParams, index: jax.Array
@@ -218,7 +229,6 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         is_stalled = speed < config.stalled_speed
         stalled = jnp.where(is_stalled, state.stalled + running, 0)
         time = jnp.int32(state.time) + running
-        before, _ = observation.distance_and_bearing(state.vehicle.position, state.goal)
         distance, _ = observation.distance_and_bearing(vehicle.position, state.goal)
         roll, pitch, yaw = vehicle.rpy
         xy = vehicle.position[:2]
@@ -239,9 +249,10 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         )
         ending = jnp.where(running, ending, state.ending)
         climb = vehicle.position[2] - state.vehicle.position[2]
+        left = params.cost_to_go(state)
         gain = reward(
             config.reward,
-            progress=before - distance,
+            progress=left - params.cost_to_go(dataclasses.replace(state, vehicle=vehicle)),
             distance=distance,
             stalled=is_stalled,
             roll=roll,
@@ -283,7 +294,8 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
     ) -> jax.Array:
         """`[O]` float32, see `observation.observe`, and the model's embedding of the ground."""
         del key, action
-        return self._see(params.believed(state), state)
+        routes = params.routes.select(state.route)
+        return self._see(params.believed(state), routes, state)
 
     def is_terminated(self, state: NavigationState, params: NavigationParams) -> jax.Array:
         """Whether the task itself is over."""
@@ -313,9 +325,9 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         """How networks should read observations."""
         return Senses(observation.ARCS, EMBEDDING_SHAPE if self.config.embeddings else None)
 
-    def _see(self, terrain: TerrainMap, state: NavigationState) -> jax.Array:
-        chassis = self.config.chassis
-        seen = observation.observe(terrain, chassis, state.vehicle, state.goal, state.action)
+    def _see(self, terrain: TerrainMap, routes: Routes, state: NavigationState) -> jax.Array:
+        chassis, vehicle = self.config.chassis, state.vehicle
+        seen = observation.observe(terrain, chassis, vehicle, state.goal, routes, state.action)
         if not self.config.embeddings:
             return seen
         return observation.with_embedding(seen, embedding(state.history))
@@ -338,8 +350,12 @@ def _make_params(
     config = env.config
     reveal.check(config.reveal, terrain)
     pool = tasks.validate(pool, terrain, config.goal_radius, config.map_margin)
+    if config.reveal.partial:
+        routes = route.straight(config.route, terrain, pool.goal)
+    else:
+        routes = route.plan(config.route, terrain, config.chassis, pool.world, pool.goal)
     settle = devices.shared_out(partial(_settle, env), len(pool.world))
-    starts, start_observation = settle(dynamics, terrain, pool)
+    starts, start_observation = settle(dynamics, terrain, routes, pool)
     finite = np.all(np.isfinite(starts.vehicle.vector), axis=-1)
     if not finite.all():
         i = int(np.argmin(finite))
@@ -349,13 +365,14 @@ def _make_params(
             f"{int(pool.world[i])}, start {np.asarray(pool.start)[i].tolist()}); "
             f"{np.sum(~finite)} of {finite.size} tasks are so"
         )
-    return _params(env, dynamics, terrain, starts, start_observation)
+    return _params(env, dynamics, terrain, routes, starts, start_observation)
 
 
 def _params(
     env: NavigationEnv,
     dynamics: Params,
     terrain: TerrainMap,
+    routes: Routes,
     starts: NavigationState,
     start_observation: jax.Array,
 ) -> NavigationParams:
@@ -363,6 +380,7 @@ def _params(
         max_steps_in_episode=jnp.int32(round(env.config.horizon_seconds / STEP_SECONDS)),
         dynamics=dynamics,
         terrain=terrain,
+        routes=routes,
         starts=starts,
         start_observation=start_observation,
     )
@@ -370,14 +388,14 @@ def _params(
 
 @partial(jax.jit, static_argnames="env")
 def _settle(
-    env: NavigationEnv, dynamics: Params, terrain: TerrainMap, pool: Tasks
+    env: NavigationEnv, dynamics: Params, terrain: TerrainMap, routes: Routes, pool: Tasks
 ) -> tuple[NavigationState, jax.Array]:
     """States and observations of vehicles at rest: leaves `[P, ...]`, `[P, O]`."""
     standing = Command(jnp.float32(0), jnp.float32(0))
     action = env.config.action(standing)
 
     def settle(
-        dynamics: Params, terrain: TerrainMap, task: Tasks
+        dynamics: Params, terrain: TerrainMap, routes: Routes, task: Tasks, number: jax.Array
     ) -> tuple[NavigationState, jax.Array]:
         selected = terrain.select(task.world)
         vehicle = tasks.place(selected, env.config.chassis, task.start, task.yaw)
@@ -398,14 +416,17 @@ def _settle(
             history=history,
             world=task.world,
             goal=goal,
+            route=number,
             action=action,
             stalled=zero,
             ending=zero,
             variation=Variation.draw(env.variation, jax.random.key(0), action),
             belief=reveal.begin(env.config.reveal, selected, vehicle.position, vehicle.rpy[2]),
         )
-        return state, env._see(dataclasses.replace(selected, belief=state.belief), state)
+        believed = dataclasses.replace(selected, belief=state.belief)
+        return state, env._see(believed, routes.select(number), state)
 
     # Not all at once: patches of thousands of vehicles fill gigabytes.
-    settled = devices.spread(settle, (None, None, 0), _SETTLED_TOGETHER)(dynamics, terrain, pool)
-    return devices.whole(settled)
+    each = devices.spread(settle, (None, None, None, 0, 0), _SETTLED_TOGETHER)
+    numbers = jnp.arange(len(pool.world))
+    return devices.whole(each(dynamics, terrain, routes, pool, numbers))

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env.footprint import CROWN_SCALE, SLOPE_SCALE, TWIST_SCALE, footprint, places
+from vertiwm_jax.env.route import CLEARANCE, Routes
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.networks.policy import Candidates
 from vertiwm_jax.state import VehicleState
@@ -28,18 +30,15 @@ _ANGLE_SCALE = 0.5  # rad
 _SPEED_SCALE = 5.0  # m/s
 _DISTANCE_SCALE = 50.0  # m
 _HEIGHT_SCALE = 2.0  # m
-_SLOPE_SCALE = 0.4
-_TWIST_SCALE = 0.2
-_CROWN_SCALE = 0.2  # m
+ROUTE_SCALE = 10.0  # m
 _SINKAGE_SCALE = 0.1  # m
 _WALL = 1.5  # m, crown that stands for obstacles and the edge of the map
-_CLEARANCE = 0.3  # m that is kept from obstacles
 
 GOAL = slice(8, 11)
 """Where the observation holds the distance over 50 m and the cosine and sine of the bearing."""
-OBSERVATION_SIZE = 13 + 5 * _POSES + 2 * CLASS_PLACES.size
-GROUND = slice(13, 13 + 5 * _POSES)
-"""Where it holds height, crown, rise, bank and twist, of all places in turn."""
+GROUND = slice(13, 13 + 6 * _POSES)
+"""Where it holds height, crown, rise, bank, twist and route, of all places in turn."""
+OBSERVATION_SIZE = GROUND.stop + 2 * CLASS_PLACES.size
 OBSERVATION_LIMIT = 10.0
 """Every entry is clipped to this size."""
 
@@ -67,10 +66,11 @@ LAYOUT = {
     "goal bearing": Part(slice(9, 11), "cosine and sine", 1.0),
     "last action": Part(slice(11, 13), "speed and steering in [-1, 1]", 1.0),
     "height": _of_places(0, "m", _HEIGHT_SCALE),
-    "crown": _of_places(1, "m", _CROWN_SCALE),
-    "rise": _of_places(2, "m/m", _SLOPE_SCALE),
-    "bank": _of_places(3, "m/m", _SLOPE_SCALE),
-    "twist": _of_places(4, "m/m", _TWIST_SCALE),
+    "crown": _of_places(1, "m", CROWN_SCALE),
+    "rise": _of_places(2, "m/m", SLOPE_SCALE),
+    "bank": _of_places(3, "m/m", SLOPE_SCALE),
+    "twist": _of_places(4, "m/m", TWIST_SCALE),
+    "route": _of_places(5, "m", ROUTE_SCALE),
     "friction": Part(slice(GROUND.stop, OBSERVATION_SIZE, 2), "1", 1.0),
     "sinkage": Part(slice(GROUND.stop + 1, OBSERVATION_SIZE, 2), "m", _SINKAGE_SCALE),
 }
@@ -97,15 +97,15 @@ def plate_sinkage(terrain: TerrainMap) -> jax.Array:
 
 
 def arcs_ahead(observation: jax.Array) -> tuple[jax.Array, ...]:
-    """Height, crown, rise, bank and twist `[..., arcs, stations]`, scaled as observed."""
-    shape = (*observation.shape[:-1], 5, _POSES)
+    """Height, crown, rise, bank, twist and route `[..., arcs, stations]`, scaled as observed."""
+    shape = (*observation.shape[:-1], 6, _POSES)
     here_and_ahead = observation[..., GROUND].reshape(shape)
     ahead = here_and_ahead[..., 1:].reshape(*shape[:-1], ARC_STEERING.size, ARC_STATIONS.size)
     return tuple(jnp.moveaxis(ahead, -3, 0))
 
 
 def _split(observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What is seen on each arc `[..., 9, 41]`, its steering included, and all the rest."""
+    """What is seen on each arc `[..., 9, 49]`, its steering included, and all the rest."""
     ahead = jnp.concatenate(arcs_ahead(observation), axis=-1)
     steering = jnp.broadcast_to(ARC_STEERING.astype(np.float32), ahead.shape[:-1])
     here = observation[..., GROUND][..., ::_POSES]
@@ -134,6 +134,7 @@ def observe(
     chassis: Chassis,
     state: VehicleState,
     goal: jax.Array,
+    routes: Routes,
     action: jax.Array,
 ) -> jax.Array:
     """`[OBSERVATION_SIZE]` float32 seen by one vehicle on the selected world.
@@ -142,10 +143,11 @@ def observe(
     bearing; the last action; what the ground would do to the vehicle here and at places on nine
     arcs up to six wheelbases long (mean height under the wheels against now; crown between them,
     which the belly meets, and a wall where an obstacle or the edge of the map would be hit; rise;
-    bank; twist, which lifts wheels); friction and plate sinkage at some of the places, -1 off
-    the map.
+    bank; twist, which lifts wheels; route, by how much more the way to the goal costs from there
+    than from here, and here by how much more than its distance); friction and plate sinkage at
+    some of the places, -1 off the map.
 
-    goal: `[3]` m; action: `[2]` in [-1, 1].
+    goal: `[3]` m; routes: to it; action: `[2]` in [-1, 1].
     """
     yaw = state.rpy[2]
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
@@ -166,23 +168,20 @@ def observe(
         return state.position[:2] + jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
     place, heading = poses_ahead(chassis)
-    forward = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * chassis.wheelbase / 2
-    left = np.stack([-np.sin(heading), np.cos(heading)], axis=-1) * chassis.track / 2
-    corners = (forward + left, forward - left, -forward + left, -forward - left)
-    xy = at(np.stack([place, *(place + corner for corner in corners)]))
-    middle, fl, fr, rl, rr = query.height(terrain, xy)
-    mean = (fl + fr + rl + rr) / 4
-    size = chassis.length + 2 * _CLEARANCE, chassis.width + 2 * _CLEARANCE
-    blocked = obstacles.collides(terrain, at(place), yaw + heading, *size)
+    xy = at(place)
+    under = footprint(chassis, query.height(terrain, places(chassis, xy, yaw + heading)))
+    size = chassis.length + 2 * CLEARANCE, chassis.width + 2 * CLEARANCE
+    blocked = obstacles.collides(terrain, xy, yaw + heading, *size)
     # Heights repeat beyond the edge of the map, which would look like the best of roads.
-    blocked |= edge_distance(terrain, at(place)) < 0
-    crown = jnp.where(blocked, _WALL, middle - mean)
+    blocked |= edge_distance(terrain, xy) < 0
+    cost = routes.cost_to_go(terrain, xy)
     ground = (
-        (mean - state.position[2]) / _HEIGHT_SCALE,
-        crown / _CROWN_SCALE,
-        (fl + fr - rl - rr) / (2 * chassis.wheelbase * _SLOPE_SCALE),
-        (fl + rl - fr - rr) / (2 * chassis.track * _SLOPE_SCALE),
-        (fl + rr - fr - rl) / (2 * chassis.track * _TWIST_SCALE),
+        (under.mean - state.position[2]) / _HEIGHT_SCALE,
+        jnp.where(blocked, _WALL / CROWN_SCALE, under.crown),
+        under.rise,
+        under.bank,
+        under.twist,
+        jnp.append(cost[0] - distance, cost[1:] - cost[0]) / ROUTE_SCALE,
     )
 
     xy = at(place[CLASS_PLACES])

@@ -13,7 +13,7 @@ from vertiwm_jax.env.termination import Ending
 class RewardConfig:
     """Weights in Verti-Bench's shape; all are gains, penalties are subtracted.
 
-    progress: for each metre that the goal comes nearer.
+    progress: for each metre by which what the way to the goal costs falls.
     stalled: for each step spent standing.
     tilt: for roll and for pitch beyond `tilt_limit`.
     tilt_limit: rad.
@@ -50,7 +50,7 @@ def reward(
 ) -> jax.Array:
     """`[...]` reward of one 0.1 s step.
 
-    progress: m that the goal came nearer; distance: m left; stalled: bool; roll, pitch: rad;
+    progress: m by which the cost to go fell; distance: m left; stalled: bool; roll, pitch: rad;
     vertical_speed: m/s in the world frame; disagreement: m; ending: `Ending` codes.
     """
 

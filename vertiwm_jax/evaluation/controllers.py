@@ -6,9 +6,9 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax.env.driver import Policy
+from vertiwm_jax.env.footprint import Difficulty
 from vertiwm_jax.env.navigation import NavigationConfig
-from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, GOAL, arcs_ahead
-from vertiwm_jax.geometry import wrap
+from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, GOAL, ROUTE_SCALE, arcs_ahead
 from vertiwm_jax.state import Command
 
 REFERENCE = "straight to goal"
@@ -45,42 +45,31 @@ class StraightToGoal:
 
 @struct.dataclass
 class LookAhead:
-    """Holds one speed and steers along the arc that keeps level and leads to the goal.
+    """Holds one speed and steers along the arc that keeps level and leads on to the goal.
 
-    The cost of an arc is what is too steep, twisted or crowned on it, near places first, and how
-    far it turns from the goal; the steering is the mean over arcs, weighed by exp(-cost / spread).
+    The cost of an arc is how hard the ground on it is, near places first, and what the way to the
+    goal costs from its far places; the steering is the mean over arcs, weighed by
+    exp(-cost / spread).
 
-    config: of the environment. speed: m/s. bank, rise, twist, crown, turn: weights of the cost.
-    tolerated: bank and rise below it cost nothing, scaled as observed. reach: wheelbases over
-    which places lose weight. turning: arc length, in wheelbases, that is compared to the bearing.
+    config: of the environment. speed: m/s. reach: wheelbases over which places lose weight.
+    onward: weight of each metre that is left to go. far: stations from which that is told.
     """
 
     config: NavigationConfig = struct.field(pytree_node=False)
     speed: float = struct.field(pytree_node=False, default=4.0)
-    bank: float = struct.field(pytree_node=False, default=1.0)
-    rise: float = struct.field(pytree_node=False, default=1.45)
-    twist: float = struct.field(pytree_node=False, default=2.3)
-    crown: float = struct.field(pytree_node=False, default=1.1)
-    turn: float = struct.field(pytree_node=False, default=2.2)
-    tolerated: float = struct.field(pytree_node=False, default=0.4)
-    spread: float = struct.field(pytree_node=False, default=0.4)
+    difficulty: Difficulty = struct.field(pytree_node=False, default=Difficulty())
     reach: float = struct.field(pytree_node=False, default=2.7)
-    turning: float = struct.field(pytree_node=False, default=1.2)
+    onward: float = struct.field(pytree_node=False, default=0.15)
+    far: tuple[int, int] = struct.field(pytree_node=False, default=(5, 7))
+    spread: float = struct.field(pytree_node=False, default=0.4)
 
     def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """`[..., O]` observation to `[..., 2]` action; the key is not used."""
-        _, crown, rise, bank, twist = arcs_ahead(observation)
-        cost = (
-            self.bank * jnp.maximum(jnp.abs(bank) - self.tolerated, 0.0) ** 2
-            + self.rise * jnp.maximum(jnp.abs(rise) - self.tolerated, 0.0) ** 2
-            + self.twist * twist**2
-            + self.crown * jnp.maximum(crown, 0.0) ** 2
-        )
-        cost = jnp.sum(cost * np.exp(-ARC_STATIONS / self.reach), axis=-1)
-        _, cos, sin = jnp.moveaxis(observation[..., GOAL], -1, 0)
-        turned = self.turning * np.tan(self.config.steering_limit * ARC_STEERING)
-        off_goal = wrap(jnp.arctan2(sin, cos)[..., None] - turned)
-        share = jax.nn.softmax(-(cost + self.turn * off_goal**2) / self.spread, axis=-1)
+        _, crown, rise, bank, twist, route = arcs_ahead(observation)
+        hard = self.difficulty(crown, rise, bank, twist)
+        cost = jnp.sum(hard * np.exp(-ARC_STATIONS / self.reach), axis=-1)
+        left = ROUTE_SCALE * jnp.mean(route[..., slice(*self.far)], axis=-1)
+        share = jax.nn.softmax(-(cost + self.onward * left) / self.spread, axis=-1)
         steering = self.config.steering_limit * jnp.sum(share * ARC_STEERING, axis=-1)
         return self.config.action(Command(jnp.full_like(steering, self.speed), steering))
 

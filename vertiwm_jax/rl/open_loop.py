@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.env.navigation import NavigationParams, NavigationState
-from vertiwm_jax.env.observation import distance_and_bearing
 from vertiwm_jax.rl.imagining import Future, Imagining, Plan
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.world_model.choice import Imagined
@@ -28,7 +27,7 @@ class OpenLoopConfig:
     discount: float = 0.98
     """Of rewards, for each decision."""
     pace: float = 3.0
-    """Speed, m/s, at which a vehicle is expected to go on to the goal where a plan ends."""
+    """Speed, m/s, at which costs to go are expected to fall where a plan ends."""
     model: Imagined = "nesam"
     """What it imagines in: NeSAM predicts as well as the whole Verti-WM, many times faster."""
 
@@ -88,13 +87,12 @@ class OpenLoop(Imagining):
 
         keys = jax.random.split(key, self.config.decisions)
         future, _ = jax.lax.scan(advance, Future.of(observation, state), (candidate, keys))
-        return future.total + future.weight * self.expected(future.state)
+        return future.total + future.weight * self.expected(params, future.state)
 
-    def expected(self, state: NavigationState) -> jax.Array:
-        """The discounted return `[]` of going straight on to the goal, at a steady pace."""
+    def expected(self, params: NavigationParams, state: NavigationState) -> jax.Array:
+        """The discounted return `[]` of going on by the route to the goal, at a steady pace."""
         reward, discount = self.env.config.reward, self.config.discount
-        distance, _ = distance_and_bearing(state.vehicle.position, state.goal)
-        left = jnp.maximum(distance - self.env.config.goal_radius, 0.0)
+        left = jnp.maximum(params.cost_to_go(state) - self.env.config.goal_radius, 0.0)
         stride = self.config.pace * self.config.interval * STEP_SECONDS
         at_goal = discount ** (left / stride)
         on_the_way = reward.progress * stride * (1 - at_goal) / (1 - discount)

@@ -139,7 +139,7 @@ class Shooting(OpenLoop):
         actions = jnp.repeat(plan, self.config.interval, axis=0)
         start = state, jnp.float32(1), jnp.float32(0)
         (end, weight, total), _ = jax.lax.scan(advance, start, actions)
-        return total + weight * self.expected(end)
+        return total + weight * self.expected(params, end)
 
     def _nearness(
         self, terrain: TerrainMap, state: NavigationState, distance: jax.Array

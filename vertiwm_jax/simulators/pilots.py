@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.env import observation
+from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.driver import Policy
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.termination import edge_distance
@@ -137,7 +137,8 @@ def _act(
     else:
         belief = reveal.look(config.reveal, terrain, belief, *pose)
     terrain = replace(terrain, belief=belief)
-    seen = observation.observe(terrain, config.chassis, vehicle, goal, action)
+    routes = route.straight(config.route, terrain, goal[None, :2])
+    seen = observation.observe(terrain, config.chassis, vehicle, goal, routes, action)
     if eyes:
         seen = observation.with_embedding(seen, eyes(terrain, vehicle).latent)
     # No learned policy is random.

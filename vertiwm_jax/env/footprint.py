@@ -1,0 +1,77 @@
+"""What ground does to a vehicle that stands on it, and how hard that makes it to drive."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from vertiwm_jax.env.chassis import Chassis
+
+SLOPE_SCALE = 0.4
+TWIST_SCALE = 0.2
+CROWN_SCALE = 0.2  # m
+
+
+@struct.dataclass
+class Footprint:
+    """The ground under vehicles, leaves `[...]`.
+
+    mean: height under the wheels, m.
+    crown: of the ground midway between them above that, which the belly meets, over 0.2 m.
+    rise, bank: slopes from rear to front and from right to left, over 0.4.
+    twist: by how much the slopes of both axles differ, which lifts wheels, over 0.2.
+    """
+
+    mean: jax.Array
+    crown: jax.Array
+    rise: jax.Array
+    bank: jax.Array
+    twist: jax.Array
+
+
+def places(chassis: Chassis, xy: jax.Array, heading: jax.Array) -> jax.Array:
+    """The middles and wheels of vehicles at `[..., 2]`, m, with `[...]` heading: `[5, ..., 2]`."""
+    cos, sin = jnp.cos(heading), jnp.sin(heading)
+    forward = jnp.stack([cos, sin], axis=-1) * chassis.wheelbase / 2
+    left = jnp.stack([-sin, cos], axis=-1) * chassis.track / 2
+    corners = (forward + left, forward - left, -forward + left, -forward - left)
+    return jnp.stack([xy, *(xy + corner for corner in corners)])
+
+
+def footprint(chassis: Chassis, heights: jax.Array) -> Footprint:
+    """Of heights `[5, ...]`, m, at `places`."""
+    middle, fl, fr, rl, rr = heights
+    mean = (fl + fr + rl + rr) / 4
+    return Footprint(
+        mean=mean,
+        crown=(middle - mean) / CROWN_SCALE,
+        rise=(fl + fr - rl - rr) / (2 * chassis.wheelbase * SLOPE_SCALE),
+        bank=(fl + rl - fr - rr) / (2 * chassis.track * SLOPE_SCALE),
+        twist=(fl + rr - fr - rl) / (2 * chassis.track * TWIST_SCALE),
+    )
+
+
+@dataclass(frozen=True)
+class Difficulty:
+    """What makes ground hard to drive, as weights of what a `Footprint` has, squared.
+
+    tolerated: bank and rise up to here cost nothing.
+    """
+
+    bank: float = 1.0
+    rise: float = 1.45
+    twist: float = 2.3
+    crown: float = 1.1
+    tolerated: float = 0.4
+
+    def __call__(
+        self, crown: jax.Array, rise: jax.Array, bank: jax.Array, twist: jax.Array
+    ) -> jax.Array:
+        """`[...]`, 0 on ground that is level."""
+        return (
+            self.bank * jnp.maximum(jnp.abs(bank) - self.tolerated, 0.0) ** 2
+            + self.rise * jnp.maximum(jnp.abs(rise) - self.tolerated, 0.0) ** 2
+            + self.twist * twist**2
+            + self.crown * jnp.maximum(crown, 0.0) ** 2
+        )

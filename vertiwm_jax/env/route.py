@@ -1,0 +1,203 @@
+"""Ways to goals over ground that is known: what it costs to go on to a goal from anywhere.
+
+Ways lead through the middles of cells that tile the map, by moves to sixteen cells around. A move
+costs its length, and more where the ground would tilt, twist or ground the vehicle, or where an
+obstacle stands. Costs to go are those of the cheapest way (Bellman's equation, by value iteration).
+"""
+
+import functools
+from dataclasses import dataclass, replace
+from typing import Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from vertiwm_jax import devices
+from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env.footprint import Difficulty, footprint, places
+from vertiwm_jax.env.termination import edge_distance
+from vertiwm_jax.terrain import obstacles, query
+from vertiwm_jax.terrain.map import TerrainMap
+
+CLEARANCE = 0.3
+"""Metres that are kept from obstacles."""
+_MOVES = np.array([(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)])
+_PLACES = np.array([0.0, 0.5, 1.0])  # of a move, where the ground is looked at
+_TOGETHER = 4  # goals, or worlds, that a device works at
+_ROUNDS = 16  # of value iteration, before it is looked whether anything still changes
+_REACH = 2  # cells, of the longest moves along an axis
+_NEAR = 1.5  # cells from a goal within which the way to it is straight
+
+
+@dataclass(frozen=True)
+class RouteConfig:
+    """How ways to goals are weighed where the map is known; static.
+
+    cells: along each side of the map.
+    difficulty: what ground is hard to drive.
+    detour: m of level ground driven to avoid one of difficulty 1.
+    blocked: m driven to avoid one on which an obstacle, or the edge of the map, is touched.
+    """
+
+    cells: int = 64
+    difficulty: Difficulty = Difficulty()
+    detour: float = 2.0
+    blocked: float = 10.0
+
+    def __post_init__(self) -> None:
+        if self.cells < 4:
+            raise ValueError(f"route.cells: expected at least 4, found {self.cells}")
+        for name in ("detour", "blocked"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"route.{name}: expected at least 0, found {getattr(self, name)}")
+
+
+@struct.dataclass
+class Routes:
+    """Costs to go to P goals, one of which is selected.
+
+    cost: `[P, n, n]` m of level ground, from the middles of cells; row 0 is the northernmost.
+    number: `[]` int32, of the selected goal.
+    """
+
+    cost: jax.Array
+    number: jax.Array
+
+    def select(self, number: jax.Array) -> Self:
+        """The same with goal `[]` selected. Under `vmap` only the number is batched: no copy."""
+        return replace(self, number=jnp.asarray(number, jnp.int32))
+
+    def cost_to_go(self, terrain: TerrainMap, xy: jax.Array) -> jax.Array:
+        """`[..., 2]` points to `[...]` m, bilinear; off the map that of the nearest place on it."""
+        cells = self.cost.shape[-1]
+        place = (xy - terrain.origin) * jnp.array([1.0, -1.0]) / _cell_size(terrain, cells) - 0.5
+        # `where` and not `clip`: NaN becomes 0, and its gradient too.
+        place = jnp.minimum(jnp.where(place > 0, place, 0.0), cells - 1.0)
+        corner = jnp.minimum(place.astype(jnp.int32), cells - 2)
+        across, down = jnp.moveaxis(place - corner, -1, 0)
+        index = (self.number * cells + corner[..., 1]) * cells + corner[..., 0]
+        flat = self.cost.reshape(-1)
+
+        def at(index: jax.Array) -> jax.Array:
+            return flat.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+        upper = at(index) * (1 - across) + at(index + 1) * across
+        lower = at(index + cells) * (1 - across) + at(index + cells + 1) * across
+        return upper * (1 - down) + lower * down
+
+
+def plan(
+    config: RouteConfig, terrain: TerrainMap, chassis: Chassis, world: jax.Array, goal: jax.Array
+) -> Routes:
+    """Routes to goals `[P, 2]`, m, in worlds `[P]`; all devices work at them."""
+    of_worlds = devices.shared_out(functools.partial(_all_costs, config, chassis), terrain.worlds)
+    costs = of_worlds(terrain, jnp.arange(terrain.worlds))
+    to_goals = devices.shared_out(_all_costs_to_go, len(world))
+    return Routes(to_goals(terrain, costs, world, goal), jnp.int32(0))
+
+
+def to_goal(
+    config: RouteConfig, terrain: TerrainMap, chassis: Chassis, goal: jax.Array
+) -> jax.Array:
+    """`[n, n]` m that it costs to go on to the goal `[2]`, m, in the selected world."""
+    costs = _costs(config, chassis, terrain, terrain.world)
+    return _costs_to_go(terrain, costs[None], jnp.int32(0), goal)
+
+
+def straight(config: RouteConfig, terrain: TerrainMap, goal: jax.Array) -> Routes:
+    """The routes to goals `[P, 2]`, m, of whoever knows nothing of the ground: distances."""
+    offset = goal[:, None, None] - _middles(terrain, config.cells)
+    return Routes(jnp.linalg.norm(offset, axis=-1), jnp.int32(0))
+
+
+@functools.partial(jax.jit, static_argnames=("config", "chassis"))
+def _all_costs(
+    config: RouteConfig, chassis: Chassis, terrain: TerrainMap, world: jax.Array
+) -> jax.Array:
+    """`[W, 16, n, n]`"""
+    each = devices.spread(functools.partial(_costs, config, chassis), (None, 0), _TOGETHER)
+    return devices.whole(each(terrain, world))
+
+
+@jax.jit
+def _all_costs_to_go(
+    terrain: TerrainMap, costs: jax.Array, world: jax.Array, goal: jax.Array
+) -> jax.Array:
+    """`[P, n, n]`"""
+    each = devices.spread(_costs_to_go, (None, None, 0, 0), _TOGETHER)
+    return devices.whole(each(terrain, costs, world, goal))
+
+
+def _costs(
+    config: RouteConfig, chassis: Chassis, terrain: TerrainMap, world: jax.Array
+) -> jax.Array:
+    """`[16, n, n]` m of level ground that moves from cells cost, those of `_MOVES` and back."""
+    terrain = terrain.select(world)
+    move = _MOVES * _cell_size(terrain, config.cells)
+    length, heading = jnp.linalg.norm(move, axis=-1), jnp.arctan2(move[:, 1], move[:, 0])
+    on_the_way = (_PLACES[:, None, None] * move)[:, :, None, None]
+    xy = _middles(terrain, config.cells) + on_the_way  # [3, 8, n, n, 2]
+    heading = jnp.broadcast_to(heading[:, None, None], xy.shape[:-1])
+    ground = footprint(chassis, query.height(terrain, places(chassis, xy, heading)))
+    hard = config.difficulty(ground.crown, ground.rise, ground.bank, ground.twist)
+    size = chassis.length + 2 * CLEARANCE, chassis.width + 2 * CLEARANCE
+    blocked = obstacles.collides(terrain, xy[1], heading[1], *size)
+    blocked |= edge_distance(terrain, xy[1]) < chassis.length / 2
+    each = 1 + config.detour * jnp.mean(hard, axis=0) + config.blocked * blocked
+    there = length[:, None, None] * each
+    # A move back is as hard as the one there, which begins where it ends.
+    back = [_window(_padded(cost), -move) for cost, move in zip(there, _MOVES, strict=True)]
+    return jnp.concatenate([there, jnp.stack(back)])
+
+
+def _costs_to_go(
+    terrain: TerrainMap, costs: jax.Array, world: jax.Array, goal: jax.Array
+) -> jax.Array:
+    """`[n, n]` m to the goal `[2]`, by the costs `[W, 16, n, n]` of moves."""
+    costs, cells = costs[world], costs.shape[-1]
+    offset = (goal - _middles(terrain, cells)) / _cell_size(terrain, cells)
+    near = jnp.max(jnp.abs(offset), axis=-1) <= _NEAR
+    distance = jnp.linalg.norm(offset * _cell_size(terrain, cells), axis=-1)
+
+    # Padded all the time, so that all moves are read where the costs lie: no copies.
+    inner = (slice(_REACH, -_REACH),) * 2
+    moves = np.concatenate([_MOVES, -_MOVES])
+
+    def improve(cost: jax.Array, _: None) -> tuple[jax.Array, None]:
+        onward = [of_move + _window(cost, move) for move, of_move in zip(moves, costs, strict=True)]
+        best = functools.reduce(jnp.minimum, onward, cost[inner])
+        return cost.at[inner].set(best), None
+
+    def go_on(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        cost, _ = carry
+        better, _ = jax.lax.scan(improve, cost, length=_ROUNDS)
+        return better, jnp.any(better < cost)
+
+    begin = _padded(jnp.where(near, distance, jnp.inf)), jnp.bool(True)
+    return jax.lax.while_loop(lambda carry: carry[1], go_on, begin)[0][inner]
+
+
+def _padded(values: jax.Array) -> jax.Array:
+    """Values `[n, n]` with inf around them, as far as moves reach."""
+    return jnp.pad(values, _REACH, constant_values=jnp.inf)
+
+
+def _window(padded: jax.Array, move: np.ndarray) -> jax.Array:
+    """What padded values are where a move leads to, `[n, n]`."""
+    east, north = (int(x) for x in move)
+    rows, columns = (size - 2 * _REACH for size in padded.shape)
+    return padded[_REACH - north :, _REACH + east :][:rows, :columns]
+
+
+def _cell_size(terrain: TerrainMap, cells: int) -> jax.Array:
+    """`[2]` m along x and y."""
+    _, rows, columns = terrain.elevation.shape
+    return jnp.array([columns - 1, rows - 1]) * terrain.resolution / cells
+
+
+def _middles(terrain: TerrainMap, cells: int) -> jax.Array:
+    """`[n, n, 2]` m, of cells."""
+    place = np.stack(np.meshgrid(*2 * [np.arange(cells) + 0.5]), axis=-1).astype(np.float32)
+    return terrain.origin + place * _cell_size(terrain, cells) * jnp.array([1.0, -1.0])
