@@ -13,7 +13,7 @@ from doors import refusal
 from vertiwm_jax import collect, evaluate, runs
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env.navigation import NavigationConfig
-from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.env.observation import LAYOUT, OBSERVATION_SIZE
 from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.learning.dataset import Auxiliary
 from vertiwm_jax.mechanics import vehicle
@@ -260,16 +260,22 @@ def test_a_policy_sees_as_far_as_it_did_in_training():
     hills = np.zeros((129, 129))
     hills[:, 80:] = 3.0
     terrain = terrain_map.build(hills, np.full((16, 16), GRASS))
-    policy = jax.tree_util.Partial(lambda seen, key: jnp.stack([seen.max(), seen.min()]) / 10)
+    heights, way = LAYOUT["height"].where, LAYOUT["route"].where
+    policy = jax.tree_util.Partial(
+        lambda seen, key: jnp.stack([seen[heights].mean(), seen[way.start] / 10])
+    )
     state = np.array([0, 0, 0.5, *np.zeros(9)], np.float32)
     goal, standing = np.array([30.0, 0.0, 0.0]), np.array([-1.0, 0.0])
     acted = {}
     for sight in (12.0, np.inf):
         config = NavigationConfig(reveal=RevealConfig(range=sight))
-        belief, action, _ = pilots._act(config, policy, None, terrain, None, state, goal, standing)
-        acted[sight] = action
+        routes = pilots._route(config, terrain, goal[:2])
+        known = config, policy, None, terrain, None, routes
+        belief, acted[sight], _ = pilots._act(*known, state, goal, standing)
         assert (belief is None) == np.isinf(sight)
-    assert not np.allclose(acted[12.0], acted[np.inf])
+    assert acted[np.inf][0] - acted[12.0][0] > 0.05
+    # Of two who look at the same hills one knows that the way up costs more than its length.
+    assert acted[np.inf][1] > 0.01 > abs(acted[12.0][1])
 
 
 def test_a_rover_drives_at_full_size(maps, tmp_path):

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jax import export
 
 from vertiwm_jax.env import observation
-from vertiwm_jax.env import route as routes
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.route import Routes
@@ -44,10 +43,7 @@ def observe(config: NavigationConfig, eyes: Eyes | None) -> bytes:
 def _route(config: NavigationConfig, *arguments: jax.Array) -> jax.Array:
     """`[n, n]` m to the goal `[3]`, which follows the arguments of `_terrain`."""
     *arrays, goal = arguments
-    terrain = _terrain(*arrays)
-    if config.reveal.partial:
-        return routes.straight(config.route, terrain, goal[None, :2]).cost[0]
-    return routes.to_goal(config.route, terrain, config.chassis, goal[:2])
+    return config.route_to(_terrain(*arrays), goal[:2]).cost[0]
 
 
 def _observe(chassis: Chassis, eyes: Eyes | None, *arguments: jax.Array) -> jax.Array:

@@ -74,6 +74,12 @@ class NavigationConfig:
                 f"found {self.reveal.range:g}"
             )
 
+    def route_to(self, terrain: TerrainMap, goal: jax.Array) -> Routes:
+        """The route to the goal `[2]`, m, in the selected world; can be compiled."""
+        if self.reveal.partial:
+            return route.straight(self.route, terrain, goal[None])
+        return route.plan_one(self.route, terrain, self.chassis, goal)
+
     def command(self, action: jax.Array) -> Command:
         """`[..., 2]` action, clipped to [-1, 1], to the command it stands for."""
         action = jnp.clip(action, -1.0, 1.0)

@@ -98,12 +98,11 @@ def plan(
     return Routes(to_goals(terrain, costs, world, goal), jnp.int32(0))
 
 
-def to_goal(
-    config: RouteConfig, terrain: TerrainMap, chassis: Chassis, goal: jax.Array
-) -> jax.Array:
-    """`[n, n]` m that it costs to go on to the goal `[2]`, m, in the selected world."""
+def plan_one(config: RouteConfig, terrain: TerrainMap, chassis: Chassis, goal: jax.Array) -> Routes:
+    """The route to the goal `[2]`, m, in the selected world; can be compiled."""
     costs = _costs(config, chassis, terrain, terrain.world)
-    return _costs_to_go(terrain, costs[None], jnp.int32(0), goal)
+    route = _costs_to_go(terrain, costs[None], jnp.int32(0), goal)
+    return Routes(route[None], jnp.int32(0))
 
 
 def straight(config: RouteConfig, terrain: TerrainMap, goal: jax.Array) -> Routes:

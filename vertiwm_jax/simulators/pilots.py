@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.env import observation, route
+from vertiwm_jax.env import observation
 from vertiwm_jax.env.driver import Policy
 from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.route import Routes
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
@@ -99,6 +100,7 @@ class Learned:
         standing = Command(jnp.float32(0), jnp.float32(0))
         self._action = np.asarray(self.config.action(standing))
         self._goal: np.ndarray | None = None
+        self._routes: Routes | None = None
         self._belief: MapBelief | None = None
 
     def __call__(self, state: np.ndarray) -> np.ndarray:
@@ -106,7 +108,8 @@ class Learned:
         goal = self._goal
         if goal is None or np.linalg.norm(goal - state[:3]) < self.config.goal_radius:
             self._goal = goal = self._draw_goal(state[:2])
-        own = self.config, self.policy, self.eyes, self.terrain, self._belief
+            self._routes = _route(self.config, self.terrain, goal[:2])
+        own = self.config, self.policy, self.eyes, self.terrain, self._belief, self._routes
         self._belief, self._action, command = jax.device_get(_act(*own, state, goal, self._action))
         return command
 
@@ -119,12 +122,18 @@ class Learned:
 
 
 @jax.jit(static_argnames="config")
+def _route(config: NavigationConfig, terrain: TerrainMap, goal: jax.Array) -> Routes:
+    return config.route_to(terrain, goal)
+
+
+@jax.jit(static_argnames="config")
 def _act(
     config: NavigationConfig,
     policy: Policy,
     eyes: Eyes | None,
     terrain: TerrainMap,
     belief: MapBelief | None,
+    routes: Routes,
     state: jax.Array,
     goal: jax.Array,
     action: jax.Array,
@@ -137,7 +146,6 @@ def _act(
     else:
         belief = reveal.look(config.reveal, terrain, belief, *pose)
     terrain = replace(terrain, belief=belief)
-    routes = route.straight(config.route, terrain, goal[None, :2])
     seen = observation.observe(terrain, config.chassis, vehicle, goal, routes, action)
     if eyes:
         seen = observation.with_embedding(seen, eyes(terrain, vehicle).latent)
