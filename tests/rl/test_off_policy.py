@@ -34,7 +34,7 @@ CONFIGS = {
     "sac": SACConfig(
         **SETTINGS, initial_log_std=-0.9, initial_temperature=0.05, target_entropy=-2.0
     ),
-    "td3": TD3Config(**SETTINGS),
+    "td3": TD3Config(**SETTINGS, restraint=0.0),
 }
 TARGET = {"env": Target(), "normalise_rewards": True}
 each = pytest.mark.parametrize("name", CONFIGS)
@@ -103,6 +103,14 @@ def test_policy_finds_the_action_that_depends_on_the_observation(name):
     if name == "sac":  # the temperature keeps the entropy asked for
         assert abs(float(metrics["entropy"]) + 2) < 0.5
         assert float(metrics["temperature"]) != pytest.approx(0.05, rel=0.2)
+
+
+def test_restraint_keeps_actions_small_unless_more_are_worth_it():
+    target, observations = algorithm("td3", **TARGET, restraint=100.0), jnp.array([[-1.0], [1.0]])
+    state, _ = train(target)
+    np.testing.assert_allclose(target.policy(ProbeParams(), state)(observations), 0.0, atol=0.05)
+    with pytest.raises(ValueError, match="restraint: expected at least 0, found -1"):
+        TD3Config(**SETTINGS, restraint=-1.0)
 
 
 @each

@@ -54,8 +54,9 @@ def footprint(chassis: Chassis, heights: jax.Array) -> Footprint:
 
 @dataclass(frozen=True)
 class Difficulty:
-    """What makes ground hard to drive, as weights of what a `Footprint` has, squared.
+    """What makes ground hard to drive.
 
+    bank, rise, twist, crown: weights of the squares of what a `Footprint` has.
     tolerated: bank and rise up to here cost nothing.
     """
 

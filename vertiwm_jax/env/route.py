@@ -37,8 +37,8 @@ class RouteConfig:
 
     cells: along each side of the map.
     difficulty: what ground is hard to drive.
-    detour: m of level ground driven to avoid one of difficulty 1.
-    blocked: m driven to avoid one on which an obstacle, or the edge of the map, is touched.
+    detour: m of level ground that a metre of difficulty 1 costs beyond its length.
+    blocked: the same of a metre in which an obstacle, or the edge of the map, is touched.
     """
 
     cells: int = 64
