@@ -1,4 +1,5 @@
 import contextlib
+import itertools
 import json
 import os
 import resource
@@ -223,6 +224,14 @@ def test_progress_is_a_bar_on_a_terminal(capsys, monkeypatch):
     assert "\x1b[" in text
     assert "2,000/2,000" in text
     assert "return 3.2" in text
+
+
+def test_progress_of_slow_work_says_how_long_each_takes(capsys, monkeypatch):
+    clock = itertools.count(0.0, 25.0)
+    monkeypatch.setattr(runs.time, "monotonic", lambda: next(clock))
+    with Progress(20, "episodes") as progress:
+        progress.advance()
+    assert capsys.readouterr().out == "episodes 1/20  25 s each  475 s left\n"
 
 
 def test_metrics_are_standard_json_lines(tmp_path):

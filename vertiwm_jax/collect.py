@@ -1,17 +1,13 @@
 """`python -m vertiwm_jax.collect`: record drives in a simulator, to fit and to test models on."""
 
-import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from itertools import islice
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import numpy as np
@@ -29,7 +25,7 @@ from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig
 from vertiwm_jax.rl import ground
 from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.runs import Progress, RunError
-from vertiwm_jax.simulators import chrono, pilots, recording
+from vertiwm_jax.simulators import chrono, pilots, processes, recording
 from vertiwm_jax.simulators.builtin import BuiltIn
 from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.simulators.protocol import SimulatorError
@@ -147,7 +143,7 @@ def collect(command: Collect) -> None:
     total = len(missing) * command.drives * command.steps
     print(f"{len(missing)} of {terrain.worlds} worlds are left", flush=True)
     began, done = time.monotonic(), 0
-    with _simulating(command.jobs) as mapped, Progress(total, "steps") as progress:
+    with processes.simulating(command.jobs) as mapped, Progress(total, "steps") as progress:
         found = mapped(record, tasks)
         for world in missing:
             drives = []
@@ -186,21 +182,6 @@ def record(task: Task) -> Drive:
             f"{ATTEMPTS} attempts ({longest.ending})"
         )
     return longest
-
-
-@contextmanager
-def _simulating(jobs: int) -> Iterator[Callable[..., Iterator[Any]]]:
-    """`map`, in this process or in several."""
-    if jobs == 1:
-        yield map
-        return
-    # Not forked: JAX has threads. Ctrl-C is for this process, which then ends the others.
-    ignore = signal.SIGINT, signal.SIG_IGN
-    executor = ProcessPoolExecutor(jobs, get_context("spawn"), signal.signal, ignore)
-    try:
-        yield executor.map
-    finally:
-        executor.shutdown(cancel_futures=True)
 
 
 def _terrain(command: Collect, scale: float) -> TerrainMap:

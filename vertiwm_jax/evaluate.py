@@ -156,7 +156,9 @@ class Navigation:
     shooting: ShootingConfig = ShootingConfig()
     """The same of planning by gradients."""
     simulator: ModelName | Literal["chrono"] = "builtin"
-    """What moves the vehicle; Chrono needs PyChrono, and drives one task after the other."""
+    """What moves the vehicle; Chrono needs PyChrono, and moves one in each process."""
+    jobs: int = 1
+    """Processes that drive, in Chrono."""
     vehicle: str | None = None
     """Name or YAML file of another vehicle than the policy's training was meant for."""
     worlds: Path | None = None
@@ -183,6 +185,8 @@ class Navigation:
             raise ValueError(f"{found[0]}: is of procedural worlds, give it or worlds")
         if self.obstacles and not self.worlds:
             raise ValueError("obstacles: is of given worlds; procedural ones are a suite")
+        if self.jobs < 1 or (self.jobs > 1 and self.simulator != "chrono"):
+            raise ValueError("jobs: expected 1 or more, and 1 in all simulators but Chrono")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -317,7 +321,8 @@ def _navigate(command: Navigation) -> None:
         policies = {REFERENCE: policies[REFERENCE]}
     judge = navigation.evaluate
     if command.simulator == "chrono":
-        judge = partial(outside.evaluate, Chrono, ground.test_tasks(config.ground, terrain))
+        tasks = ground.test_tasks(config.ground, terrain)
+        judge = partial(outside.evaluate, Chrono, command.jobs, tasks)
     groups = report.drive(test.env, test.params, policies, config.key("testing"), judge)
     print(f"\n{report.markdown(groups, REFERENCE)}")
     if command.output:

@@ -231,7 +231,7 @@ class Progress:
             rate = self._done / max(now - self._start, 1e-9)
             left = max(self._total - self._done, 0) / max(rate, 1e-9)
             print(
-                f"{self._description} {self._done:,}/{self._total:,}  {rate:,.0f}/s  "
+                f"{self._description} {self._done:,}/{self._total:,}  {_pace(rate)}  "
                 f"{left:,.0f} s left  {note}".rstrip(),
                 flush=True,
             )
@@ -239,7 +239,12 @@ class Progress:
 
 class _RateColumn(rich.progress.ProgressColumn):
     def render(self, task: rich.progress.Task) -> str:
-        return f"{task.speed or 0:,.0f}/s"
+        return _pace(task.speed or 0.0)
+
+
+def _pace(rate: float) -> str:
+    """So many a second, or how long each takes."""
+    return f"{1 / rate:,.0f} s each" if 0 < rate < 1 else f"{rate:,.0f}/s"
 
 
 def read_metrics(folder: str | Path) -> list[dict[str, float]]:

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from env.worlds import SNOW, hills
 
 from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
@@ -17,7 +18,8 @@ from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.world_model.choice import sighted
 
 
-def test_the_built_in_simulator_outside_jit_is_that_inside():
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_the_built_in_simulator_outside_jit_is_that_inside(jobs):
     semantic = np.full((16, 16), SNOW)
     semantic[:, 8:] = 0
     box = np.array([[15.0, -30.0, 4, 4, 3]])
@@ -33,7 +35,8 @@ def test_the_built_in_simulator_outside_jit_is_that_inside():
     env = NavigationEnv(moves[0], config)
     params = env.make_params(moves[1], terrain, tasks)
     arguments = env, params, jax.tree_util.Partial(led_by_embedding), jax.random.key(0)
-    inside, found = navigation.evaluate(*arguments), outside.evaluate(BuiltIn, tasks, *arguments)
+    inside = navigation.evaluate(*arguments)
+    found = outside.evaluate(BuiltIn, jobs, tasks, *arguments)
     assert found.ending.tolist() == [Ending.GOAL, Ending.COLLIDED, Ending.TIMED_OUT]
     for name in ("ending", "steps", "world"):
         np.testing.assert_array_equal(getattr(found, name), getattr(inside, name))

@@ -1,4 +1,4 @@
-"""How well a policy drives in a simulator outside jit: the same task, one episode at a time."""
+"""How well a policy drives in a simulator outside jit: the same task, a vehicle a process."""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,13 +14,14 @@ from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation.navigation import NavigationResult
 from vertiwm_jax.runs import Progress
-from vertiwm_jax.simulators import following
+from vertiwm_jax.simulators import following, processes
 from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.terrain.map import TerrainMap
 
 
 def evaluate(
     simulator: Callable[[TerrainMap], Simulator],
+    jobs: int,
     tasks: Tasks,
     env: NavigationEnv,
     params: NavigationParams,
@@ -29,22 +30,40 @@ def evaluate(
 ) -> NavigationResult:
     """As `navigation.evaluate`, with the vehicle in `simulator` on the world of each task.
 
-    tasks: of which `params` has the starts.
+    jobs: processes that drive; tasks: of which `params` has the starts.
     """
     env = following.followed(env)
     driver = policy if isinstance(policy, Driver) else Reactive(policy)
-    episodes = []
-    with Progress(params.pool_size, "episodes") as progress:
-        for i in range(params.pool_size):
-            task = jax.tree.map(lambda x, i=i: x[i], jax.device_get(tasks))
-            vehicle = simulator(params.terrain.select(task.world))
-            pose = (*task.start.tolist(), float(task.yaw))
-            start = jax.tree.map(lambda x, i=i: x[i], params.starts)
-            observation, state = following.start(vehicle, env, params, start, pose)
-            own = jax.random.fold_in(key, i)
-            episodes.append(_episode(vehicle, env, params, driver, observation, state, own))
+    own = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(params.pool_size))
+    shared = jax.device_get((tasks, params, driver, jax.random.key_data(own)))
+    one, episodes = partial(_drive, simulator, env, *shared), []
+    with (
+        processes.simulating(jobs) as mapped,
+        Progress(params.pool_size, "episodes") as progress,
+    ):
+        for episode in mapped(one, range(params.pool_size)):
+            episodes.append(episode)
             progress.advance()
     return jax.tree.map(lambda *x: jnp.stack(x), *episodes)
+
+
+def _drive(
+    simulator: Callable[[TerrainMap], Simulator],
+    env: NavigationEnv,
+    tasks: Tasks,
+    params: NavigationParams,
+    driver: Driver,
+    keys: np.ndarray,
+    number: int,
+) -> NavigationResult:
+    """Task `number`; everything comes from and goes to host memory, as between processes."""
+    task, start = jax.tree.map(lambda x: x[number], (tasks, params.starts))
+    params, driver, start = jax.device_put((params, driver, start))
+    vehicle = simulator(params.terrain.select(task.world))
+    pose = (*task.start.tolist(), float(task.yaw))
+    observation, state = following.start(vehicle, env, params, start, pose)
+    key = jax.random.wrap_key_data(jnp.asarray(keys[number]))
+    return jax.device_get(_episode(vehicle, env, params, driver, observation, state, key))
 
 
 def _episode(

@@ -1,0 +1,23 @@
+"""Simulations side by side: each process of its own moves one vehicle at a time."""
+
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import Any
+
+
+@contextmanager
+def simulating(jobs: int) -> Iterator[Callable[..., Iterator[Any]]]:
+    """`map`, in this process or in several."""
+    if jobs == 1:
+        yield map
+        return
+    # Not forked: JAX has threads. Ctrl-C is for this process, which then ends the others.
+    ignore = signal.SIGINT, signal.SIG_IGN
+    executor = ProcessPoolExecutor(jobs, get_context("spawn"), signal.signal, ignore)
+    try:
+        yield executor.map
+    finally:
+        executor.shutdown(cancel_futures=True)
