@@ -1,6 +1,7 @@
 """The table of policies from end to end, on settings so small that compiling is all their cost."""
 
 import shutil
+import sys
 
 import pytest
 from doors import opened, refusal
@@ -66,4 +67,11 @@ def test_tables_without_sense_are_refused(tmp_path):
         CompareConfig(rows=(row, row))
     message = refusal(compare.main, "--settings", tmp_path / "none", "--runs", tmp_path / "runs")
     assert "ppo.yaml: no such file" in message
+    assert not (tmp_path / "runs").exists()
+
+
+def test_chrono_is_asked_for_before_hours_of_training(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pychrono", None)
+    message = refusal(compare.main, "--simulators", "chrono", "--runs", tmp_path / "runs")
+    assert "expected PyChrono 9.0" in message
     assert not (tmp_path / "runs").exists()

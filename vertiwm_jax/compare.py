@@ -12,15 +12,17 @@ from vertiwm_jax import policy_training, runs
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env.driver import Driver, Policy
 from vertiwm_jax.evaluate import ALGORITHMS
-from vertiwm_jax.evaluation import policy_table, report
+from vertiwm_jax.evaluation import outside, policy_table, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
 from vertiwm_jax.evaluation.navigation import NavigationResult
+from vertiwm_jax.evaluation.outside import Arena
 from vertiwm_jax.evaluation.policy_table import TrainingCost
 from vertiwm_jax.evaluation.report import Results
 from vertiwm_jax.policy_training import TrainConfig
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.ground import SUITES, GroundConfig, Suite
 from vertiwm_jax.runs import Run
+from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.training import failures_in_one_line, keep_compiled
 from vertiwm_jax.world_model.choice import ModelName
@@ -48,12 +50,16 @@ class CompareConfig:
 
     rows: tyro.conf.Suppress[tyro.conf.Fixed[tuple[Row, ...]]]
     """Which policies; in a file only."""
-    simulators: tuple[ModelName, ...] = ("builtin",)
-    """What they are judged in."""
+    simulators: tuple[Arena, ...] = ("builtin",)
+    """What they are judged in; Chrono needs PyChrono."""
     suites: tuple[Suite, ...] = tuple(SUITES)
     """Kinds of worlds that they are judged on."""
     suite_worlds: int = 10
-    """How many worlds of each, with ten tasks each."""
+    """How many worlds of each."""
+    pairs: int = 10
+    """Tasks in a world."""
+    jobs: int = 1
+    """Processes that drive, in Chrono."""
     seed: int = 0
     """Draws the worlds; how policies are trained has seeds of its own."""
     settings: Path | None = None
@@ -76,7 +82,7 @@ class CompareConfig:
     @property
     def grounds(self) -> GroundConfig:
         """What is driven on."""
-        return GroundConfig(suites=self.suites, suite_worlds=self.suite_worlds)
+        return GroundConfig(suites=self.suites, suite_worlds=self.suite_worlds, pairs=self.pairs)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -84,12 +90,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     program = "python -m vertiwm_jax.compare"
     config = configuration.parse_resumable(CompareConfig, "table3", argv, program)
     keep_compiled(config.compile_cache)
-    with failures_in_one_line(ConfigError):
+    with failures_in_one_line(ConfigError, SimulatorError):
         settings = {row: training(config, row) for row in config.rows}
         vehicles = {chosen.vehicle for chosen in settings.values()}
         if len(vehicles) > 1:
             names = " and ".join(sorted(vehicles))
             raise ConfigError(f"{config.settings}: vehicle: expected one for all, found {names}")
+        for simulator in config.simulators:
+            outside.expect(simulator, settings[config.rows[0]])
         with Run.begin(config, config.name) as run:
             print(f"run folder {run.folder}", flush=True)
             folders = {row: _train(row, settings[row], run.folder) for row in config.rows}
@@ -124,7 +132,7 @@ def _judge_all(
     rows.append((first, lambda _: baselines(first.asked)))
     judged = {}
     for simulator in config.simulators:
-        judged[simulator] = _judge(config.grounds, rows, terrain, simulator)
+        judged[simulator] = _judge(config, rows, terrain, simulator)
         radius = first.navigation.goal_radius
         report.write(output / simulator, judged[simulator], REFERENCE, terrain, radius)
     costs = {str(row): TrainingCost.of(folder) for row, folder in folders.items()}
@@ -144,17 +152,18 @@ def _learned(row: Row, settings: TrainConfig, folder: Path) -> Policies:
 
 
 def _judge(
-    grounds: GroundConfig,
+    config: CompareConfig,
     rows: Sequence[tuple[TrainConfig, Policies]],
     terrain: TerrainMap,
-    simulator: ModelName,
+    simulator: Arena,
 ) -> dict[str, Results]:
     """Episodes of every policy, by suite."""
     groups: dict[str, dict[str, NavigationResult]] = {}
     for settings, policies in rows:
-        settings = replace(settings, ground=grounds)
-        test = task.test_environment(settings, terrain, simulator)
-        driven = report.drive(test.env, test.params, policies(terrain), settings.key("testing"))
+        settings = replace(settings, ground=config.grounds)
+        test, judge = outside.test_in(simulator, config.jobs, settings, terrain)
+        key = settings.key("testing")
+        driven = report.drive(test.env, test.params, policies(terrain), key, judge)
         for suite, results in driven.items():
             groups.setdefault(suite, {}).update(results)
     return dict(groups)

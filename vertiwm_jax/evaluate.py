@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -20,7 +19,6 @@ from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.evaluation import (
     adaptation,
     calibration,
-    navigation,
     outside,
     plots,
     prediction,
@@ -28,6 +26,7 @@ from vertiwm_jax.evaluation import (
     report,
 )
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
+from vertiwm_jax.evaluation.outside import Arena
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.fit import FitConfig
 from vertiwm_jax.learning import dataset
@@ -43,8 +42,6 @@ from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
 from vertiwm_jax.rl.shooting import Shooting, ShootingConfig
 from vertiwm_jax.runs import RunError
 from vertiwm_jax.sac import SACTraining
-from vertiwm_jax.simulators import chrono
-from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.td3 import TD3Training
 from vertiwm_jax.terrain.soil import PRESETS
@@ -155,7 +152,7 @@ class Navigation:
     """How it plans, and in which model, whatever moves the vehicle."""
     shooting: ShootingConfig = ShootingConfig()
     """The same of planning by gradients."""
-    simulator: ModelName | Literal["chrono"] = "builtin"
+    simulator: Arena = "builtin"
     """What moves the vehicle; Chrono needs PyChrono, and moves one in each process."""
     jobs: int = 1
     """Processes that drive, in Chrono."""
@@ -288,19 +285,15 @@ def _compared(folders: Sequence[Path]) -> dict[str, tuple[Dynamics, Params]]:
 
 
 def _navigate(command: Navigation) -> None:
-    if command.simulator == "chrono":
-        chrono.modules()
     run = command.policy if isinstance(command.policy, Path) else None
     file = run / "config.yaml" if run else configuration.default_config("ppo")
     try:
         trained = training(file)
         config = _adapted(trained, command)
-        if command.simulator == "chrono" and config.vehicle != HMMWV:
-            raise ConfigError(f"vehicle: expected {HMMWV} in Chrono, found {config.vehicle}")
+        outside.expect(command.simulator, config)
         maps, scale = command.worlds, config.driven.scale
         terrain = ground.load(config.ground, maps, scale) if maps else task.held_out(config)
-        model = "builtin" if command.simulator == "chrono" else command.simulator
-        test = task.test_environment(config, terrain, model)
+        test, judge = outside.test_in(command.simulator, command.jobs, config, terrain)
     except ValueError as error:  # what is wrong with configuration, maps, or tasks on them
         sys.exit(f"error: {error}")
     policies = baselines(config.asked)
@@ -319,10 +312,6 @@ def _navigate(command: Navigation) -> None:
         policies = {"shooting": shooting} | policies
     elif command.policy == "straight":
         policies = {REFERENCE: policies[REFERENCE]}
-    judge = navigation.evaluate
-    if command.simulator == "chrono":
-        tasks = ground.test_tasks(config.ground, terrain)
-        judge = partial(outside.evaluate, Chrono, command.jobs, tasks)
     groups = report.drive(test.env, test.params, policies, config.key("testing"), judge)
     print(f"\n{report.markdown(groups, REFERENCE)}")
     if command.output:

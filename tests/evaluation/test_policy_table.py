@@ -47,6 +47,8 @@ def test_every_simulator_has_a_table_of_all_policies():
     text = policy_table.markdown(costs, judged)
     first, second = text.split("**vertiwm**")
     learned, straight = first.strip().splitlines()[-2:]
-    assert learned.startswith("| ppo in vertiwm | 2.0 | 3,000 | 3/4, 10.0 s | 1/4, 10.0 s | 19/20")
-    assert straight == "| straight to goal |  |  | 0/4 | 2/4, 10.0 s |  |"
-    assert "hard" not in second and "| 1/4, 10.0 s |" in second
+    level = "0.0 / 0.0 deg"
+    solved = f"3/4, 10.0 s, {level} | 1/4, 10.0 s, {level}"
+    assert learned.startswith(f"| ppo in vertiwm | 2.0 | 3,000 | {solved} | 19/20")
+    assert straight == f"| straight to goal |  |  | 0/4, {level} | 2/4, 10.0 s, {level} |  |"
+    assert "hard" not in second and f"| 1/4, 10.0 s, {level} |" in second

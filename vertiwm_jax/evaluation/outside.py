@@ -2,21 +2,48 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env.driver import Driver, Memory, Policy, Reactive
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.evaluation.navigation import NavigationResult
+from vertiwm_jax.evaluation.report import Judge
+from vertiwm_jax.mechanics.vehicle import HMMWV
+from vertiwm_jax.rl import ground, task
+from vertiwm_jax.rl.task import Task, TaskConfig
 from vertiwm_jax.runs import Progress
-from vertiwm_jax.simulators import following, processes
+from vertiwm_jax.simulators import chrono, following, processes
+from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model.choice import ModelName
+
+Arena = ModelName | Literal["chrono"]
+"""What moves a vehicle whose policy is judged."""
+
+
+def expect(arena: Arena, config: TaskConfig) -> None:
+    """`SimulatorError` or `ConfigError` where policies of these settings cannot be judged there."""
+    if arena == "chrono":
+        chrono.modules()
+        if config.vehicle != HMMWV:
+            raise ConfigError(f"vehicle: expected {HMMWV} in Chrono, found {config.vehicle}")
+
+
+def test_in(arena: Arena, jobs: int, config: TaskConfig, terrain: TerrainMap) -> tuple[Task, Judge]:
+    """The test on these worlds, and what drives it; jobs: processes, where it is Chrono."""
+    if arena != "chrono":
+        return task.test_environment(config, terrain, arena), navigation.evaluate
+    tasks = ground.test_tasks(config.ground, terrain)
+    return task.test_environment(config, terrain), partial(evaluate, Chrono, jobs, tasks)
 
 
 def evaluate(

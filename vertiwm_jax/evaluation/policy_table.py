@@ -1,5 +1,6 @@
 """Policies of several trainings in one table, with what the paper reports (Table III) beside."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +29,8 @@ class TrainingCost:
 
 
 def markdown(costs: Mapping[str, TrainingCost], judged: Mapping[str, Mapping[str, Results]]) -> str:
-    """A table for each simulator: costs of the trained policies, success and time by suite."""
+    """A table for each simulator: costs of the trained policies, and how they drive by suite:
+    successes, their mean time, and mean absolute roll and pitch."""
     tables = (f"**{name}**\n\n{_table(costs, groups)}" for name, groups in judged.items())
     return "\n\n".join(tables)
 
@@ -49,4 +51,5 @@ def _table(costs: Mapping[str, TrainingCost], groups: Mapping[str, Results]) -> 
 
 def _cell(row: Summary) -> str:
     time = f", {row.seconds:.1f} s" if row.successes else ""
-    return f"{row.successes}/{row.tasks}{time}"
+    tilt = f"{math.degrees(row.abs_roll):.1f} / {math.degrees(row.abs_pitch):.1f} deg"
+    return f"{row.successes}/{row.tasks}{time}, {tilt}"
