@@ -14,8 +14,11 @@ from benchmarks._harness import cell
 
 _APART = {"recurrent_baseline"}
 """Those that need a folder of drives, and train."""
-_NEEDS = {"torch_peer": "torch"}
-"""Packages of the extra `peers` that some compare with."""
+_NEEDS = {
+    "chrono": ("pychrono", "see docs/collect.md"),
+    "torch_peer": ("torch", 'pip install -e ".[peers]"'),
+}
+"""Packages that some compare with, and where they come from."""
 
 
 def page(found: dict[str, Any]) -> str:
@@ -43,8 +46,9 @@ def main() -> None:
     for name in names:
         if name.startswith("_") or name in _APART:
             continue
-        if name in _NEEDS and not find_spec(_NEEDS[name]):
-            print(f'{name} is left out: it needs {_NEEDS[name]} (pip install -e ".[peers]")')
+        if name in _NEEDS and not find_spec(_NEEDS[name][0]):
+            package, source = _NEEDS[name]
+            print(f"{name} is left out: it needs {package} ({source})")
             continue
         print(f"{name} ...", flush=True)
         command = [sys.executable, "-m", f"benchmarks.{name}", "--json"]

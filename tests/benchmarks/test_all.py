@@ -21,6 +21,9 @@ def test_peers_that_are_not_installed_are_left_out_in_one_line(tmp_path, monkeyp
     monkeypatch.setattr(sys, "argv", ["benchmarks", "--output", str(tmp_path / "page.md")])
     everything.main()
     assert "benchmarks.models" in ran
-    assert not {"benchmarks.torch_peer", "benchmarks.peers"} & set(ran)
-    lines = [line for line in capsys.readouterr().out.splitlines() if "torch_peer" in line]
-    assert lines == ['torch_peer is left out: it needs torch (pip install -e ".[peers]")']
+    assert not {"benchmarks.chrono", "benchmarks.torch_peer", "benchmarks.peers"} & set(ran)
+    lines = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
+    assert lines == [
+        "chrono is left out: it needs pychrono (see docs/collect.md)",
+        'torch_peer is left out: it needs torch (pip install -e ".[peers]")',
+    ]
