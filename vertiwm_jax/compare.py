@@ -22,6 +22,8 @@ from vertiwm_jax.policy_training import TrainConfig
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.ground import SUITES, GroundConfig, Suite
 from vertiwm_jax.runs import Run
+from vertiwm_jax.simulators import processes
+from vertiwm_jax.simulators.processes import Map
 from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.training import failures_in_one_line, keep_compiled
@@ -132,7 +134,8 @@ def _judge_all(
     rows.append((first, lambda _: baselines(first.asked)))
     judged = {}
     for simulator in config.simulators:
-        judged[simulator] = _judge(config, rows, terrain, simulator)
+        with processes.simulating(config.jobs) as mapped:
+            judged[simulator] = _judge(config.grounds, rows, terrain, simulator, mapped)
         radius = first.navigation.goal_radius
         report.write(output / simulator, judged[simulator], REFERENCE, terrain, radius)
     costs = {str(row): TrainingCost.of(folder) for row, folder in folders.items()}
@@ -152,16 +155,18 @@ def _learned(row: Row, settings: TrainConfig, folder: Path) -> Policies:
 
 
 def _judge(
-    config: CompareConfig,
+    grounds: GroundConfig,
     rows: Sequence[tuple[TrainConfig, Policies]],
     terrain: TerrainMap,
     simulator: Arena,
+    mapped: Map,
 ) -> dict[str, Results]:
     """Episodes of every policy, by suite."""
     groups: dict[str, dict[str, NavigationResult]] = {}
     for settings, policies in rows:
-        settings = replace(settings, ground=config.grounds)
-        test, judge = outside.test_in(simulator, config.jobs, settings, terrain)
+        settings = replace(settings, ground=grounds)
+        test = outside.test_in(simulator, settings, terrain)
+        judge = outside.judge_in(simulator, settings, terrain, mapped)
         key = settings.key("testing")
         driven = report.drive(test.env, test.params, policies(terrain), key, judge)
         for suite, results in driven.items():

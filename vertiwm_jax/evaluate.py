@@ -42,6 +42,7 @@ from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
 from vertiwm_jax.rl.shooting import Shooting, ShootingConfig
 from vertiwm_jax.runs import RunError
 from vertiwm_jax.sac import SACTraining
+from vertiwm_jax.simulators import processes
 from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.td3 import TD3Training
 from vertiwm_jax.terrain.soil import PRESETS
@@ -293,7 +294,7 @@ def _navigate(command: Navigation) -> None:
         outside.expect(command.simulator, config)
         maps, scale = command.worlds, config.driven.scale
         terrain = ground.load(config.ground, maps, scale) if maps else task.held_out(config)
-        test, judge = outside.test_in(command.simulator, command.jobs, config, terrain)
+        test = outside.test_in(command.simulator, config, terrain)
     except ValueError as error:  # what is wrong with configuration, maps, or tasks on them
         sys.exit(f"error: {error}")
     policies = baselines(config.asked)
@@ -312,7 +313,9 @@ def _navigate(command: Navigation) -> None:
         policies = {"shooting": shooting} | policies
     elif command.policy == "straight":
         policies = {REFERENCE: policies[REFERENCE]}
-    groups = report.drive(test.env, test.params, policies, config.key("testing"), judge)
+    with processes.simulating(command.jobs) as mapped:
+        judge = outside.judge_in(command.simulator, config, terrain, mapped)
+        groups = report.drive(test.env, test.params, policies, config.key("testing"), judge)
     print(f"\n{report.markdown(groups, REFERENCE)}")
     if command.output:
         radius = config.navigation.goal_radius

@@ -13,6 +13,7 @@ from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation import navigation, outside
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.simulators import processes
 from vertiwm_jax.simulators.builtin import BuiltIn
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.world_model.choice import sighted
@@ -36,7 +37,8 @@ def test_the_built_in_simulator_outside_jit_is_that_inside(jobs):
     params = env.make_params(moves[1], terrain, tasks)
     arguments = env, params, jax.tree_util.Partial(led_by_embedding), jax.random.key(0)
     inside = navigation.evaluate(*arguments)
-    found = outside.evaluate(BuiltIn, jobs, tasks, *arguments)
+    with processes.simulating(jobs) as mapped:
+        found = outside.evaluate(BuiltIn, mapped, tasks, *arguments)
     assert found.ending.tolist() == [Ending.GOAL, Ending.COLLIDED, Ending.TIMED_OUT]
     for name in ("ending", "steps", "world"):
         np.testing.assert_array_equal(getattr(found, name), getattr(inside, name))

@@ -20,8 +20,9 @@ from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.task import Task, TaskConfig
 from vertiwm_jax.runs import Progress
-from vertiwm_jax.simulators import chrono, following, processes
+from vertiwm_jax.simulators import chrono, following
 from vertiwm_jax.simulators.chrono import Chrono
+from vertiwm_jax.simulators.processes import Map
 from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.choice import ModelName
@@ -38,17 +39,21 @@ def expect(arena: Arena, config: TaskConfig) -> None:
             raise ConfigError(f"vehicle: expected {HMMWV} in Chrono, found {config.vehicle}")
 
 
-def test_in(arena: Arena, jobs: int, config: TaskConfig, terrain: TerrainMap) -> tuple[Task, Judge]:
-    """The test on these worlds, and what drives it; jobs: processes, where it is Chrono."""
+def test_in(arena: Arena, config: TaskConfig, terrain: TerrainMap) -> Task:
+    """The test on these worlds."""
+    return task.test_environment(config, terrain, "builtin" if arena == "chrono" else arena)
+
+
+def judge_in(arena: Arena, config: TaskConfig, terrain: TerrainMap, mapped: Map) -> Judge:
+    """What drives the tasks of `test_in`; mapped: as in `evaluate`, for Chrono."""
     if arena != "chrono":
-        return task.test_environment(config, terrain, arena), navigation.evaluate
-    tasks = ground.test_tasks(config.ground, terrain)
-    return task.test_environment(config, terrain), partial(evaluate, Chrono, jobs, tasks)
+        return navigation.evaluate
+    return partial(evaluate, Chrono, mapped, ground.test_tasks(config.ground, terrain))
 
 
 def evaluate(
     simulator: Callable[[TerrainMap], Simulator],
-    jobs: int,
+    mapped: Map,
     tasks: Tasks,
     env: NavigationEnv,
     params: NavigationParams,
@@ -57,17 +62,14 @@ def evaluate(
 ) -> NavigationResult:
     """As `navigation.evaluate`, with the vehicle in `simulator` on the world of each task.
 
-    jobs: processes that drive; tasks: of which `params` has the starts.
+    mapped: of `processes.simulating`; tasks: of which `params` has the starts.
     """
     env = following.followed(env)
     driver = policy if isinstance(policy, Driver) else Reactive(policy)
     own = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(params.pool_size))
     shared = jax.device_get((tasks, params, driver, jax.random.key_data(own)))
     one, episodes = partial(_drive, simulator, env, *shared), []
-    with (
-        processes.simulating(jobs) as mapped,
-        Progress(params.pool_size, "episodes") as progress,
-    ):
+    with Progress(params.pool_size, "episodes") as progress:
         for episode in mapped(one, range(params.pool_size)):
             episodes.append(episode)
             progress.advance()

@@ -7,9 +7,12 @@ from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import Any
 
+Map = Callable[..., Iterator[Any]]
+"""`map`, or what does the same in several processes: functions and values must pickle."""
+
 
 @contextmanager
-def simulating(jobs: int) -> Iterator[Callable[..., Iterator[Any]]]:
+def simulating(jobs: int) -> Iterator[Map]:
     """`map`, in this process or in several."""
     if jobs == 1:
         yield map
