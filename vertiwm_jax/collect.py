@@ -3,7 +3,6 @@
 import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, fields, replace
 from itertools import islice
 from pathlib import Path
@@ -118,8 +117,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("stopped; the same command goes on with the worlds that are left")
         sys.exit(130)
-    except BrokenProcessPool:
-        sys.exit("error: a process that simulated was killed; the same command goes on")
     except (SimulatorError, RunError, CheckpointError, ConfigError, MapError, OSError) as error:
         sys.exit(f"error: {error}")
     print(f"the drives are in {command.output}; to fit the world model to them:")

@@ -86,10 +86,10 @@ def _drive(
     number: int,
 ) -> NavigationResult:
     """Task `number`; everything comes from and goes to host memory, as between processes."""
-    task, start = jax.tree.map(lambda x: x[number], (tasks, params.starts))
+    asked, start = jax.tree.map(lambda x: x[number], (tasks, params.starts))
     params, driver, start = jax.device_put((params, driver, start))
-    vehicle = simulator(params.terrain.select(task.world))
-    pose = (*task.start.tolist(), float(task.yaw))
+    vehicle = simulator(params.terrain.select(asked.world))
+    pose = (*asked.start.tolist(), float(asked.yaw))
     observation, state = following.start(vehicle, env, params, start, pose)
     key = jax.random.wrap_key_data(jnp.asarray(keys[number]))
     return jax.device_get(_episode(vehicle, env, params, driver, observation, state, key))

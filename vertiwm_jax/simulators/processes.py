@@ -3,9 +3,12 @@
 import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import Any
+
+from vertiwm_jax.simulators.protocol import SimulatorError
 
 Map = Callable[..., Iterator[Any]]
 """`map`, or what does the same in several processes: functions and values must pickle."""
@@ -13,7 +16,7 @@ Map = Callable[..., Iterator[Any]]
 
 @contextmanager
 def simulating(jobs: int) -> Iterator[Map]:
-    """`map`, in this process or in several."""
+    """`map`, in this process or in several; `SimulatorError` where one of those is killed."""
     if jobs == 1:
         yield map
         return
@@ -22,5 +25,9 @@ def simulating(jobs: int) -> Iterator[Map]:
     executor = ProcessPoolExecutor(jobs, get_context("spawn"), signal.signal, ignore)
     try:
         yield executor.map
+    except BrokenProcessPool:
+        raise SimulatorError(
+            "a process that simulated was killed, perhaps for want of memory; fewer jobs need less"
+        ) from None
     finally:
         executor.shutdown(cancel_futures=True)
