@@ -129,6 +129,18 @@ def test_nothing_is_learned_while_warming_up(name):
         assert int(two.learner.update) == target.config.updates
 
 
+@each
+def test_an_average_of_the_actor_drives(name):
+    single = {"policy_delay": 1} if name == "td3" else {}
+    target = algorithm(name, **TARGET, updates=1, target_rate=0.25, **single)
+    first = compiled(target)[0](ProbeParams(), jax.random.key(0)).learner.actor
+    state, _ = train(target, iterations=2)  # one gradient step: see above
+    average = jax.tree.map(lambda x, y: 0.75 * x + 0.25 * y, first, state.learner.actor)
+    chex.assert_trees_all_close(target.policy(ProbeParams(), state).params, average, atol=1e-7)
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_close(state.learner.actor, average, atol=1e-7)
+
+
 def test_a_reward_that_is_no_number_is_noticed():
     broken = algorithm("td3", Broken(), normalise_rewards=True)
     _, metrics = train(broken, iterations=4)

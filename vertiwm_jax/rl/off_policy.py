@@ -27,10 +27,16 @@ Params = Any
 
 
 class Twins(Protocol):
-    """What a rule has learned: the weights of an actor, and of two critics."""
+    """What a rule has learned: the weights of two critics and of an actor, and these averaged.
+
+    The average drives in the end: single gradient steps throw the actor about.
+    """
 
     @property
     def actor(self) -> Params: ...
+
+    @property
+    def averaged(self) -> Params: ...
 
     @property
     def critics(self) -> Params: ...
@@ -52,7 +58,8 @@ class OffPolicyConfig(LearningConfig):
     warm_up: int = 8_192
     """Transitions by random actions before anything is learned."""
     target_rate: float = 0.005
-    """Share of the critics that the target critics take over in a gradient step (tau)."""
+    """Share of the critics that the target critics take over in a gradient step (tau), and of the
+    actor that its average does."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -251,7 +258,8 @@ class OffPolicy(Generic[Learner]):
 
     def policy(self, env_params: Params, state: OffPolicyState[Learner]) -> MeanAction:
         """What `state` has learned."""
-        return MeanAction(self._networks(env_params).actor, state.learner.actor, state.observations)
+        actor = self._networks(env_params).actor
+        return MeanAction(actor, state.learner.averaged, state.observations)
 
     def value(self, env_params: Params, state: OffPolicyState[Learner]) -> TwinValue:
         """What `state` expects of its policy."""

@@ -38,9 +38,11 @@ class SACConfig(OffPolicyConfig):
 
 @struct.dataclass
 class SACLearner:
-    """What SAC has learned; target: of both critics, behind them; the rest are Adam's states."""
+    """What SAC has learned; averaged: the actor over its updates; target: of both critics, behind
+    them; the rest are Adam's states."""
 
     actor: Params
+    averaged: Params
     critics: Params
     target: Params
     log_temperature: jax.Array
@@ -64,6 +66,7 @@ class SAC:
         log_temperature = jnp.log(jnp.float32(self.config.initial_temperature))
         return SACLearner(
             actor=actor,
+            averaged=jax.tree.map(jnp.array, actor),
             critics=critics,
             target=jax.tree.map(jnp.array, critics),
             log_temperature=log_temperature,
@@ -105,11 +108,13 @@ class SAC:
             learner.temperature_optimiser,
             learner.log_temperature,
         )
+        rate = self.config.target_rate
         learner = replace(
             learner,
             actor=actor,
+            averaged=optax.incremental_update(actor, learner.averaged, rate),
             critics=critics,
-            target=optax.incremental_update(critics, learner.target, self.config.target_rate),
+            target=optax.incremental_update(critics, learner.target, rate),
             log_temperature=log_temperature,
             actor_optimiser=actor_optimiser,
             critic_optimiser=critic_optimiser,

@@ -50,6 +50,11 @@ class TD3Learner:
     critic_optimiser: Any
     update: jax.Array
 
+    @property
+    def averaged(self) -> Params:
+        """The actor over its updates, which its target is."""
+        return self.actor_target
+
 
 @dataclass(frozen=True)
 class TD3:
