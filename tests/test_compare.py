@@ -65,6 +65,8 @@ def test_tables_without_sense_are_refused(tmp_path):
         CompareConfig(rows=())
     with pytest.raises(ValueError, match="once"):
         CompareConfig(rows=(row, row))
+    with pytest.raises(ValueError, match="jobs: expected at least 1, found 0"):
+        CompareConfig(rows=(row,), jobs=0)
     message = refusal(compare.main, "--settings", tmp_path / "none", "--runs", tmp_path / "runs")
     assert "ppo.yaml: no such file" in message
     assert not (tmp_path / "runs").exists()

@@ -80,6 +80,9 @@ class CompareConfig:
             raise ValueError("rows, simulators: expected at least one of each, found none")
         if len(set(self.rows)) < len(self.rows):
             raise ValueError("rows: expected each of them once, found one again")
+        for name in ("suite_worlds", "pairs", "jobs"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
 
     @property
     def grounds(self) -> GroundConfig:
