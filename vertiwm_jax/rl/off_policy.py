@@ -60,9 +60,14 @@ class OffPolicyConfig(LearningConfig):
     target_rate: float = 0.005
     """Share of the critics that the target critics take over in a gradient step (tau), and of the
     actor that its average does."""
+    restraint: float = 0.1
+    """What the square of actions costs the actor, in units of the mean size of values. Without it
+    actors run to the limits of their actions before critics know what those are worth."""
 
     def __post_init__(self):
         super().__post_init__()
+        if self.restraint < 0:
+            raise ValueError(f"restraint: expected at least 0, found {self.restraint}")
         for name in ("updates", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
@@ -103,10 +108,16 @@ class Networks:
     actor: SquashedActor
     critic: ActionCritic
     optimiser: optax.GradientTransformation
+    restraint: float
 
     def twins(self, params: Params, observation: jax.Array, action: jax.Array) -> jax.Array:
         """`[2, ...]` values of actions, as both critics have them."""
         return twin_values(self.critic, params, observation, action)
+
+    def cost(self, action: jax.Array, value: jax.Array) -> jax.Array:
+        """What `[B, A]` actions cost an actor beside their values `[B]`: see `restraint`."""
+        size = jax.lax.stop_gradient(jnp.mean(jnp.abs(value)))
+        return self.restraint * size * jnp.mean(jnp.sum(action**2, axis=-1))
 
     def init(self, key: jax.Array, observation: jax.Array) -> tuple[Params, Params]:
         """Weights of the actor and of two critics; `observation` `[O]`."""
@@ -277,6 +288,7 @@ class OffPolicy(Generic[Learner]):
                 optax.clip_by_global_norm(config.max_gradient_norm),
                 optax.adam(config.learning_rate),
             ),
+            config.restraint,
         )
 
     def _warming_up(self, state: OffPolicyState[Learner]) -> jax.Array:

@@ -95,9 +95,11 @@ class SAC:
         )
 
         def actor_loss(actor: Params) -> tuple[jax.Array, jax.Array]:
-            action, log_prob = _policy(networks, actor, batch.observation).sample(actor_key)
+            policy = _policy(networks, actor, batch.observation)
+            action, log_prob = policy.sample(actor_key)
             value = jnp.minimum(*networks.twins(critics, batch.observation, action))
-            return jnp.mean(temperature * log_prob - value), -jnp.mean(log_prob)
+            cost = networks.cost(policy.mean, value)
+            return cost + jnp.mean(temperature * log_prob - value), -jnp.mean(log_prob)
 
         (policy_loss, entropy), gradient = jax.value_and_grad(actor_loss, has_aux=True)(
             learner.actor

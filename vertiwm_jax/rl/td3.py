@@ -25,13 +25,10 @@ class TD3Config(OffPolicyConfig):
     """Where that noise is cut off."""
     policy_delay: int = 2
     """Gradient steps of the critics for each of the actor and of the targets."""
-    restraint: float = 0.1
-    """What the square of actions costs the actor, in units of the mean size of values. Without it
-    actors run to the limits of their actions before critics know what those are worth."""
 
     def __post_init__(self):
         super().__post_init__()
-        for name in ("exploration", "smoothing", "largest_smoothing", "restraint"):
+        for name in ("exploration", "smoothing", "largest_smoothing"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}: expected at least 0, found {getattr(self, name)}")
         if self.policy_delay < 1:
@@ -121,9 +118,7 @@ class TD3:
         def actor_loss(actor: Params) -> jax.Array:
             action = _action(networks, actor, batch.observation)
             value = networks.twins(learner.critics, batch.observation, action)[0]
-            size = jax.lax.stop_gradient(jnp.mean(jnp.abs(value)))
-            cost = self.config.restraint * size * jnp.mean(jnp.sum(action**2, axis=-1))
-            return cost - jnp.mean(value)
+            return networks.cost(action, value) - jnp.mean(value)
 
         loss, gradient = jax.value_and_grad(actor_loss)(learner.actor)
         actor, optimiser = networks.descend(gradient, learner.actor_optimiser, learner.actor)
