@@ -50,6 +50,8 @@ def main() -> None:
     everywhere = devices.on_all(mesh)
     iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=everywhere)
     with jax.set_mesh(mesh):
+        iterate = iterate.lower(params, state).compile()
+        devices.release_memory()
         for _ in range(chosen.iterations):
             state, _ = iterate(params, state)
     jax.block_until_ready(state)

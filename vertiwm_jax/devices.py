@@ -5,7 +5,9 @@ is shared out already, everything is computed in one place.
 """
 
 import contextlib
+import ctypes
 import os
+import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, TypeVar
@@ -70,6 +72,9 @@ def everywhere(mesh: Mesh, tree: T) -> T:
     """A pytree of arrays, of which every device has a copy; of several hosts, the first one's."""
     places = on_all(mesh)
     if not mesh.is_multi_process:
+        if mesh.devices.flat[0].platform == "cpu":
+            # All cores read one copy: JAX takes arrays of NumPy as they lie in memory.
+            tree = hosts.with_keys(tree, jax.tree.map(np.asarray, hosts.without_keys(tree)))
         return jax.device_put(tree, places)
     sent = hosts.of_first(hosts.without_keys(tree))
     placed = jax.tree.map(partial(jax.make_array_from_process_local_data, places), sent)
@@ -93,9 +98,19 @@ def shared_out(function: Callable[..., T], batch: int) -> Callable[..., T]:
         over = mesh(batch)
         with jax.set_mesh(over):
             result = function(*everywhere(over, args))
-        return in_one_place(jax.device_put(result, on_all(over)))
+        release_memory()
+        if over.is_multi_process:
+            return in_one_place(jax.device_put(result, on_all(over)))
+        return in_one_place(everywhere(over, result))
 
     return on_mesh
+
+
+def release_memory() -> None:
+    """Gives back to the system what compilers have freed, which glibc keeps for later."""
+    if sys.platform == "linux":
+        with contextlib.suppress(AttributeError):  # Other C libraries have no such function.
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def spread(

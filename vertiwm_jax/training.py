@@ -160,6 +160,7 @@ def train(
     iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=devices.on_all(mesh))
     with jax.set_mesh(mesh):
         iterate = iterate.lower(data, state).compile()
+    devices.release_memory()
     print(f"compiled in {time.perf_counter() - start:.0f} s", flush=True)
 
     total = (iterations - done) * work.amount

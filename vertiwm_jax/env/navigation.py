@@ -435,4 +435,4 @@ def _settle(
     # Not all at once: patches of thousands of vehicles fill gigabytes.
     each = devices.spread(settle, (None, None, None, 0, 0), _SETTLED_TOGETHER)
     numbers = jnp.arange(len(pool.world))
-    return devices.whole(each(dynamics, terrain, routes, pool, numbers))
+    return each(dynamics, terrain, routes, pool, numbers)

@@ -117,7 +117,7 @@ def _all_costs(
 ) -> jax.Array:
     """`[W, 16, n, n]`"""
     each = devices.spread(functools.partial(_costs, config, chassis), (None, 0), _TOGETHER)
-    return devices.whole(each(terrain, world))
+    return each(terrain, world)
 
 
 @jax.jit
@@ -126,7 +126,7 @@ def _all_costs_to_go(
 ) -> jax.Array:
     """`[P, n, n]`"""
     each = devices.spread(_costs_to_go, (None, None, 0, 0), _TOGETHER)
-    return devices.whole(each(terrain, costs, world, goal))
+    return each(terrain, costs, world, goal)
 
 
 def _costs(

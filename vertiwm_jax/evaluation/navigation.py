@@ -143,7 +143,7 @@ def _evaluate(
     # Row 0 is the start, which no step led to.
     counted = (jnp.arange(length)[:, None] < steps)[..., None]
     mean_tilt = jnp.sum(jnp.abs(rpy[1:]) * counted, axis=0) / jnp.maximum(steps, 1)[:, None]
-    result = NavigationResult(
+    return NavigationResult(
         ending=end.ending,
         steps=steps,
         abs_roll=mean_tilt[:, 0],
@@ -155,7 +155,6 @@ def _evaluate(
         position=jnp.swapaxes(position, 0, 1),
         rpy=jnp.swapaxes(rpy, 0, 1),
     )
-    return devices.whole(result)
 
 
 @dataclasses.dataclass(frozen=True)
