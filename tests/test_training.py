@@ -2,6 +2,8 @@
 
 import os
 import signal
+from dataclasses import dataclass
+from typing import ClassVar
 
 import chex
 import jax
@@ -98,3 +100,19 @@ def test_what_is_not_finite_ends_the_training_with_the_last_good_checkpoint(new_
 def test_settings_below_one_are_refused():
     with pytest.raises(ValueError, match="keep: expected at least 1, found 0"):
         CheckpointConfig(keep=0)
+
+
+def test_what_comes_again_is_not_compiled_again(new_run):
+    @dataclass(frozen=True)
+    class Traced(Counting):
+        traces: ClassVar[list[int]] = []
+
+        def iterate(self, data, state):
+            self.traces.append(1)
+            return super().iterate(data, state)
+
+    for start in (1.0, 5.0):
+        data, work = jnp.float32(start), Work("pages", 5, ("count",))
+        state = training.train(Traced(), data, jax.random.key(0), new_run(), 3, work, CONFIG)
+        chex.assert_trees_all_equal(state, Counter(jnp.float32(start + 3)))
+    assert len(Traced.traces) == 1

@@ -1,6 +1,7 @@
 """The host loop of training: progress, metrics and checkpoints around a compiled algorithm."""
 
 import contextlib
+import functools
 import re
 import signal
 import sys
@@ -14,6 +15,7 @@ from typing import Any, Protocol, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from vertiwm_jax import checkpoints, devices, hosts
 from vertiwm_jax.checkpoints import CheckpointError
@@ -157,9 +159,8 @@ def train(
     start = time.perf_counter()
     # Between iterations every device has all, so that checkpoints do not know of devices.
     data, state = devices.everywhere(mesh, (data, state))
-    iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=devices.on_all(mesh))
     with jax.set_mesh(mesh):
-        iterate = iterate.lower(data, state).compile()
+        iterate = _program(algorithm, mesh).lower(data, state).compile()
     devices.release_memory()
     print(f"compiled in {time.perf_counter() - start:.0f} s", flush=True)
 
@@ -190,6 +191,12 @@ def train(
             f"go on with --resume {run.outermost}"
         )
     return devices.in_one_place(state)
+
+
+@functools.lru_cache(maxsize=1)
+def _program(algorithm: Algorithm[State], mesh: Mesh) -> Any:
+    """An iteration; one that is asked for again has been compiled, like gates after the first."""
+    return jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=devices.on_all(mesh))
 
 
 def _mean(values: np.ndarray) -> float | None:
