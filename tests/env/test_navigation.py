@@ -8,6 +8,7 @@ import pytest
 from env.worlds import BICYCLE, Scripted, bicycle_env, ground, hills, step_of_many, task
 from flax import struct
 
+from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.reward import RewardConfig
@@ -162,7 +163,7 @@ def test_reward_of_a_step_is_that_computed_by_hand():
 
 
 def test_actions_are_commands_and_back():
-    config = NavigationConfig(speed_range=(-1.0, 5.0), steering_limit=0.4)
+    config = NavigationConfig(speed_range=(-1.0, 5.0), chassis=Chassis(steering_limit=0.4))
     command = config.command(jnp.array([[-1.0, 0.5], [1.0, -3.0], [0.0, 0.0]]))
     np.testing.assert_allclose(command.speed, [-1, 5, 2], rtol=1e-6)
     np.testing.assert_allclose(command.steering, [0.2, -0.4, 0], rtol=1e-6)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -6,6 +8,7 @@ from env.worlds import GRASS, SNOW, hills
 
 from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.route import RouteConfig
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
@@ -79,7 +82,7 @@ def test_poses_lie_on_the_arcs_of_a_bicycle():
     np.testing.assert_allclose(x[4], driven)
     np.testing.assert_allclose([y[4], heading[4]], 0, atol=1e-12)
     # The sharpest one, to the left, goes round (0, radius).
-    radius = CHASSIS.wheelbase / np.tan(0.37)
+    radius = CHASSIS.wheelbase / np.tan(CHASSIS.steering_limit)
     np.testing.assert_allclose(np.hypot(x[-1], y[-1] - radius), radius)
     np.testing.assert_allclose(np.arctan2(x[-1], radius - y[-1]), driven / radius)
     np.testing.assert_allclose(heading[-1], driven / radius)
@@ -244,3 +247,13 @@ def test_the_edge_of_the_map_is_a_wall():
     outside = observation.poses_ahead(CHASSIS)[0][1:, 0] > 5.0
     np.testing.assert_allclose(crown[outside], 7.5, rtol=1e-6)
     assert np.all(crown[~outside] < 2.0) and 0 < outside.sum() < outside.size
+
+
+def test_arcs_are_those_that_a_vehicle_can_steer():
+    sharp = replace(CHASSIS, steering_limit=0.6)
+    heading = observation.poses_ahead(sharp)[1][1:].reshape(observation.ARC_STEERING.size, -1)
+    # With half of the action, half of the angle: what is commanded is what was looked at.
+    command = NavigationConfig(chassis=sharp).command(jnp.array([0.0, 0.5]))
+    driven = CHASSIS.wheelbase * observation.ARC_STATIONS
+    turned = driven * np.tan(float(command.steering)) / CHASSIS.wheelbase
+    np.testing.assert_allclose(heading[6], turned, rtol=1e-6)

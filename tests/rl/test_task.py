@@ -6,6 +6,7 @@ import pytest
 
 from vertiwm_jax import config
 from vertiwm_jax.config import ConfigError
+from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.rl import task
@@ -17,13 +18,13 @@ GROUND = GroundConfig(suites=("easy",), suite_worlds=1, pairs=2)
 
 
 def test_the_hmmwv_is_as_navigation_says():
-    asked = NavigationConfig(steering_limit=0.3)
+    asked = NavigationConfig(chassis=Chassis(steering_limit=0.3))
     assert TaskConfig(navigation=asked).asked == asked
 
 
 def test_another_vehicle_brings_its_chassis_and_its_steering():
     rover, found = vehicle.load("rover"), TaskConfig(vehicle="rover").asked
-    assert found.steering_limit == rover.steering_limit
+    assert found.chassis.steering_limit == rover.steering_limit
     np.testing.assert_allclose(found.chassis.wheelbase, rover.scale * rover.wheelbase, rtol=1e-6)
     np.testing.assert_allclose(found.chassis.width, rover.scale * rover.width, rtol=1e-6)
 

@@ -49,7 +49,7 @@ def about(policy: Corrected | MeanAction, config: NavigationConfig, held: int) -
         },
         "action": {
             "speed_range": config.speed_range,
-            "steering_limit": config.steering_limit,
+            "steering_limit": config.chassis.steering_limit,
             "standing": standing.tolist(),
         },
         "arcs": {"steering": ARC_STEERING.tolist(), "stations": ARC_STATIONS.tolist()},

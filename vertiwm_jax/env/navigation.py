@@ -37,7 +37,6 @@ class NavigationConfig:
     goal_radius: m from the goal, in three dimensions, at which it is reached.
     horizon_seconds: time limit.
     speed_range: commanded speed in m/s at actions -1 and 1; negative drives backwards.
-    steering_limit: front-wheel angle in rad at action 1.
     map_margin: m from the edge of the map at which a vehicle is off it.
     rollover_angle: rad of roll or of pitch.
     stalled_speed, stuck_seconds: slower than this is stalled, for this long without a break stuck.
@@ -52,7 +51,6 @@ class NavigationConfig:
     goal_radius: float = 8.0
     horizon_seconds: float = 60.0
     speed_range: tuple[float, float] = (0.0, 6.0)
-    steering_limit: float = 0.3725
     map_margin: float = 1.0
     rollover_angle: float = np.pi / 3
     stalled_speed: float = 0.3
@@ -85,13 +83,14 @@ class NavigationConfig:
         action = jnp.clip(action, -1.0, 1.0)
         low, high = self.speed_range
         speed = low + (action[..., 0] + 1) / 2 * (high - low)
-        return Command(speed, action[..., 1] * self.steering_limit)
+        return Command(speed, action[..., 1] * self.chassis.steering_limit)
 
     def action(self, command: Command) -> jax.Array:
         """The `[..., 2]` action of a command, clipped to [-1, 1]; the inverse of `command`."""
         low, high = self.speed_range
         speed = (command.speed - low) / (high - low) * 2 - 1
-        return jnp.clip(jnp.stack([speed, command.steering / self.steering_limit], -1), -1.0, 1.0)
+        steering = command.steering / self.chassis.steering_limit
+        return jnp.clip(jnp.stack([speed, steering], -1), -1.0, 1.0)
 
 
 @struct.dataclass(kw_only=True)

@@ -22,7 +22,6 @@ from vertiwm_jax.terrain.map import TerrainMap
 # Where the vehicle would stand on arcs of constant steering: as far as a choice made now reaches.
 ARC_STEERING = np.linspace(-1.0, 1.0, 9)  # of the front wheels' largest angle
 ARC_STATIONS = np.array([0.45, 0.9, 1.4, 2.0, 2.7, 3.5, 4.5, 6.0])  # wheelbases along an arc
-_LARGEST_STEERING = 0.37  # rad
 _POSES = 1 + ARC_STEERING.size * ARC_STATIONS.size  # the first is where it stands now
 CLASS_PLACES = 1 + np.arange(ARC_STEERING.size * ARC_STATIONS.size).reshape(9, 8)[::4, ::2].ravel()
 
@@ -119,7 +118,7 @@ ARCS = Candidates(_split, tuple((0.0, float(steering)) for steering in ARC_STEER
 
 def poses_ahead(chassis: Chassis) -> tuple[np.ndarray, np.ndarray]:
     """Poses on the arcs, in the yaw frame: x, y in m `[P, 2]` and heading in rad `[P]`."""
-    curvature = np.tan(_LARGEST_STEERING * ARC_STEERING)[:, None] / chassis.wheelbase
+    curvature = np.tan(chassis.steering_limit * ARC_STEERING)[:, None] / chassis.wheelbase
     distance = ARC_STATIONS * chassis.wheelbase
     heading = curvature * distance
     # sinc is exact for the straight arc, where the radius is infinite.

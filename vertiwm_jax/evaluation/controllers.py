@@ -70,7 +70,7 @@ class LookAhead:
         cost = jnp.sum(hard * np.exp(-ARC_STATIONS / self.reach), axis=-1)
         left = ROUTE_SCALE * jnp.mean(route[..., slice(*self.far)], axis=-1)
         share = jax.nn.softmax(-(cost + self.onward * left) / self.spread, axis=-1)
-        steering = self.config.steering_limit * jnp.sum(share * ARC_STEERING, axis=-1)
+        steering = self.config.chassis.steering_limit * jnp.sum(share * ARC_STEERING, axis=-1)
         return self.config.action(Command(jnp.full_like(steering, self.speed), steering))
 
 

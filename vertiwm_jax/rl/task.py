@@ -36,7 +36,7 @@ class TaskConfig:
     ground: GroundConfig = GroundConfig()
     """What worlds and tasks."""
     navigation: NavigationConfig = NavigationConfig()
-    """What the task is; a vehicle other than the HMMWV brings chassis and steering of its own."""
+    """What the task is; a vehicle other than the HMMWV brings a chassis of its own."""
     variation: VariationConfig = VariationConfig()
     """How episodes differ from what map and model say, while learning."""
     model: ModelName = "builtin"
@@ -59,9 +59,7 @@ class TaskConfig:
         """`navigation` for the vehicle."""
         if self.vehicle == HMMWV:
             return self.navigation
-        chosen = self.driven.vehicle
-        limit = float(chosen.steering_limit)
-        return replace(self.navigation, chassis=Chassis.of(chosen), steering_limit=limit)
+        return replace(self.navigation, chassis=Chassis.of(self.driven.vehicle))
 
     def key(self, purpose: Literal["worlds", "tasks", "training", "testing"]) -> jax.Array:
         """The random key of one purpose."""
