@@ -10,9 +10,11 @@ import jax
 
 from benchmarks._harness import parser, report
 from vertiwm_jax import config as configuration
-from vertiwm_jax import devices
+from vertiwm_jax import devices, training
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
+from vertiwm_jax.rl.loop import Seeds
 
 _UNIT = 1 if sys.platform == "darwin" else 1024  # bytes, of `ru_maxrss`
 
@@ -34,26 +36,24 @@ def main() -> None:
     chosen = arguments.parse_args()
     results = {"imported": {"most_MB": most()}}
     config = configuration.load(PPOTraining, configuration.default_config(chosen.config))
-    training, _ = task.training_environment(config)
-    jax.block_until_ready(training.params)
-    params = training.params
+    terrain, pool, _ = task.training_ground(config)
+    dynamics, weights = task.dynamics(config, config.model)
+    env = NavigationEnv(dynamics, config.asked, config.variation)
+    algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
+    training.compiled(algorithm, env.shapes(weights, terrain, pool), batch)
+    results["compiled"] = {"most_MB": most()}
+    params = jax.block_until_ready(env.make_params(weights, terrain, pool))
     results["worlds and starts"] = {
         "most_MB": most(),
         "terrain_MB": size(params.terrain),
         "starts_MB": size(params.starts),
     }
-    algorithm = config.algorithm(training.env)
-    mesh = devices.mesh(config.ppo.shareable)
     state = jax.jit(algorithm.init)(params, config.key("training"))
+    iterate, mesh = training.compiled(algorithm, params, batch), devices.mesh(batch)
     params, state = devices.everywhere(mesh, (params, state))
-    del training
-    everywhere = devices.on_all(mesh)
-    iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=everywhere)
-    with jax.set_mesh(mesh):
-        iterate = iterate.lower(params, state).compile()
-        devices.release_memory()
-        for _ in range(chosen.iterations):
-            state, _ = iterate(params, state)
+    devices.release_memory()
+    for _ in range(chosen.iterations):
+        state, _ = iterate(params, state)
     jax.block_until_ready(state)
     results["learning"] = {
         "most_MB": most(),

@@ -24,19 +24,28 @@ def phases(name: str) -> dict[str, float]:
     import jax
 
     from vertiwm_jax import config as configuration
+    from vertiwm_jax import devices, training
+    from vertiwm_jax.env.navigation import NavigationEnv
     from vertiwm_jax.ppo import PPOTraining
     from vertiwm_jax.rl import task
+    from vertiwm_jax.rl.loop import Seeds
 
     lap("import_s")
     config = configuration.load(PPOTraining, configuration.default_config(name))
-    training, _ = task.training_environment(config)
-    jax.block_until_ready(training.params)
-    lap("worlds_and_starts_s")
-    algorithm = config.algorithm(training.env)
-    state = jax.jit(algorithm.init)(training.params, config.key("training"))
-    iterate = jax.jit(algorithm.iterate, donate_argnums=1).lower(training.params, state).compile()
+    terrain, pool, _ = jax.block_until_ready(task.training_ground(config))
+    lap("worlds_s")
+    dynamics, weights = task.dynamics(config, config.model)
+    env = NavigationEnv(dynamics, config.asked, config.variation)
+    algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
+    training.compiled(algorithm, env.shapes(weights, terrain, pool), batch)
     lap("compile_s")
-    jax.block_until_ready(iterate(training.params, state))
+    params = jax.block_until_ready(env.make_params(weights, terrain, pool))
+    lap("starts_s")
+    state = jax.jit(algorithm.init)(params, config.key("training"))
+    iterate = training.compiled(algorithm, params, batch)
+    params, state = devices.everywhere(devices.mesh(batch), (params, state))
+    lap("weights_s")
+    jax.block_until_ready(iterate(params, state))
     lap("first_iteration_s")
     return seconds
 

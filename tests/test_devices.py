@@ -86,6 +86,21 @@ def test_results_of_what_is_shared_out_are_on_one_device():
     np.testing.assert_array_equal(result, 2 * np.arange(16))
 
 
+@pytest.mark.parametrize("at_a_time", [3, 5, 10])
+def test_turns_give_what_all_at_once_gives(at_a_time):
+    traced = []
+
+    @jax.jit
+    def function(batch):
+        traced.append(len(batch["a"]))
+        return {"sum": batch["a"] + batch["b"][:, 0], "first": batch["b"][:, :1]}
+
+    batch = {"a": jnp.arange(10), "b": jnp.arange(20).reshape(10, 2)}
+    found = devices.in_turns(function, batch, at_a_time)
+    assert traced == [at_a_time]
+    chex.assert_trees_all_equal(found, function(batch))
+
+
 @pytest.mark.parametrize(("run_by", "expected"), [("-m", 3), ("script.py", 1)])
 def test_commands_use_all_cores_and_scripts_what_they_ask_for(run_by, expected):
     program = (

@@ -10,9 +10,10 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
@@ -104,6 +105,31 @@ def shared_out(function: Callable[..., T], batch: int) -> Callable[..., T]:
         return in_one_place(everywhere(over, result))
 
     return on_mesh
+
+
+def in_turns(function: Callable[[Any], T], batch: Any, at_a_time: int) -> T:
+    """What a function gives for all rows of leaves `[B, ...]`, of so many of which it is asked.
+
+    All results are in memory once, and those of one turn again.
+    """
+    size = len(jax.tree.leaves(batch)[0])
+    found = None
+    for first in range(0, size, at_a_time):
+        first = min(first, size - at_a_time)  # The last turn has some rows of the one before.
+        rows = slice(first, first + at_a_time)
+        given = function(jax.tree.map(lambda x, rows=rows: x[rows], batch))
+        if found is None:
+            found = jax.tree.map(lambda x: jnp.zeros((size, *x.shape[1:]), x.dtype), given)
+        found = _with_rows(found, given, first)
+    return cast(T, found)
+
+
+@partial(jax.jit, donate_argnums=0)
+def _with_rows(tree: T, some: T, first: jax.Array) -> T:
+    """The tree with some of its rows, `first` and those that follow it, replaced."""
+    return jax.tree.map(
+        lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, first, axis=0), tree, some
+    )
 
 
 def release_memory() -> None:

@@ -48,6 +48,14 @@ def disagreement(history: History) -> jax.Array:
     return getattr(history, "disagreement", jnp.float32(0))
 
 
+def spread(history: History) -> jax.Array:
+    """`[]` m, the standard deviation of where each of an ensemble went; 0 of a single model.
+
+    A sign of what it has not learned (Lakshminarayanan et al., 2017, "deep ensembles").
+    """
+    return getattr(history, "spread", jnp.float32(0))
+
+
 def embedding(history: History) -> jax.Array:
     """`EMBEDDING_SHAPE` of the ground, as the model sees it at the state that `history` goes with.
 

@@ -20,7 +20,7 @@ from vertiwm_jax.evaluation import plots, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.learned import Corrected, MeanAction, TwinValue, Value
-from vertiwm_jax.rl.loop import LoopConfig, restore, train
+from vertiwm_jax.rl.loop import LoopConfig, prepare, restore, train
 from vertiwm_jax.rl.planning import Planner, PlanningConfig
 from vertiwm_jax.rl.settings import LearningConfig
 from vertiwm_jax.rl.task import TaskConfig
@@ -147,16 +147,24 @@ def _policies(
 def train_and_report(config: TrainConfig) -> Path:
     """Trains, or goes on with, a policy, tests it, and gives the folder of the run."""
     keep_compiled(config.compile_cache)
-    print("drawing worlds, and placing vehicles on them ...", flush=True)
+    print("drawing worlds ...", flush=True)
     with _on_usable_ground():
-        training, held_out = task.training_environment(config)
-    env, params = training.env, training.params
+        terrain, pool, held_out = task.training_ground(config)
+        dynamics, weights = task.dynamics(config, config.model)
+        env = NavigationEnv(dynamics, config.asked, config.variation)
     algorithm, schedule, seeds = config.algorithm(env), config.schedule, config.loop.seeds
     steps = schedule.collected * config.action_repeat
-    restored = restore(algorithm, params, config.resume, seeds) if config.resume else None
+    shapes = env.shapes(weights, terrain, pool)
+    restored = restore(algorithm, shapes, config.resume, seeds) if config.resume else None
     with Run.begin(config, config.name, restored[0] if restored else 0, config.wandb) as run:
         print(f"run folder {run.folder}", flush=True)
-        print(f"training in {config.model} on {params.terrain.worlds} worlds", flush=True)
+        print(f"training in {config.model} on {terrain.worlds} worlds", flush=True)
+        if not restored or restored[0] < schedule.iterations:
+            # Now, while there are no vehicles yet that fill the memory.
+            prepare(algorithm, shapes, seeds, schedule.shareable)
+        print(f"placing vehicles for {len(pool.world)} tasks ...", flush=True)
+        with _on_usable_ground():
+            params = env.make_params(weights, terrain, pool)
         key = config.key("training")
         state = train(
             algorithm,

@@ -130,6 +130,18 @@ def restore(algorithm: Algorithm[State], data: Any, folder: Path) -> tuple[int, 
     return int(checkpoint.name), checkpoints.load(checkpoint, like)
 
 
+def compiled(algorithm: Algorithm[State], data: Any, batch: int) -> Any:
+    """`iterate` as a program for the devices of `Work.batch`; the last one is kept.
+
+    data: arrays or shapes of them. To compile takes much memory, which may be there only before
+    the data are. Trainings that are alike, like those of gates, have one program.
+    """
+    kinds = jax.eval_shape(lambda x: (x, algorithm.init(x, jax.random.key(0))), data)
+    leaves, kind = jax.tree.flatten(kinds)
+    shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+    return _compiled(algorithm, devices.mesh(batch), kind, shapes)
+
+
 def train(
     algorithm: Algorithm[State],
     data: Any,
@@ -154,16 +166,10 @@ def train(
     if done >= iterations:
         return state
 
-    mesh = devices.mesh(work.batch)
-    print(f"compiling for {mesh.size} of {jax.device_count()} devices ...", flush=True)
-    start = time.perf_counter()
+    iterate = compiled(algorithm, data, work.batch)
     # Between iterations every device has all, so that checkpoints do not know of devices.
-    data, state = devices.everywhere(mesh, (data, state))
-    with jax.set_mesh(mesh):
-        iterate = _program(algorithm, mesh).lower(data, state).compile()
+    data, state = devices.everywhere(devices.mesh(work.batch), (data, state))
     devices.release_memory()
-    print(f"compiled in {time.perf_counter() - start:.0f} s", flush=True)
-
     total = (iterations - done) * work.amount
     with _interruptible() as interrupted, run.progress(total, "training") as progress:
         while done < iterations and not hosts.on_any(bool(interrupted)):
@@ -194,9 +200,17 @@ def train(
 
 
 @functools.lru_cache(maxsize=1)
-def _program(algorithm: Algorithm[State], mesh: Mesh) -> Any:
-    """An iteration; one that is asked for again has been compiled, like gates after the first."""
-    return jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=devices.on_all(mesh))
+def _compiled(algorithm: Algorithm[Any], mesh: Mesh, kind: Any, shapes: tuple[Any, ...]) -> Any:
+    """For data and state of a kind of pytree with leaves of these shapes and types."""
+    print(f"compiling for {mesh.size} of {jax.device_count()} devices ...", flush=True)
+    start, place = time.perf_counter(), devices.on_all(mesh)
+    leaves = [jax.ShapeDtypeStruct(*shape, sharding=place) for shape in shapes]
+    iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=place)
+    with jax.set_mesh(mesh):
+        done = iterate.lower(*jax.tree.unflatten(kind, leaves)).compile()
+    devices.release_memory()
+    print(f"compiled in {time.perf_counter() - start:.0f} s", flush=True)
+    return done
 
 
 def _mean(values: np.ndarray) -> float | None:

@@ -95,27 +95,29 @@ class Divided:
 
     steps: jax.Array
     disagreement: jax.Array
+    spread: jax.Array
 
 
 @dataclass(frozen=True)
 class Doubtful(Scripted):
-    """The script, by parts that are 1 cm more apart after every step that moved."""
+    """The script; after every step that moved, parts are 1 cm more apart and spread 1 mm more."""
 
     def init(self, params, terrain, state):
-        return Divided(super().init(params, terrain, state), jnp.float32(0))
+        return Divided(super().init(params, terrain, state), jnp.float32(0), jnp.float32(0))
 
     def step(self, params, terrain, history, state, command):
         state, steps = super().step(params, terrain, history.steps, state, command)
-        return state, Divided(steps, 0.01 * jnp.maximum(steps, 0))
+        moved = jnp.maximum(steps, 0)
+        return state, Divided(steps, 0.01 * moved, 0.001 * moved)
 
 
 def test_disagreement_within_a_model_costs_reward_and_ends_what_nobody_can_tell():
     script = drive([1.0, 2.0, 3.0, np.nan])
     alone = play(script, 4)
-    settings = {"reward": RewardConfig(disagreement=100.0)}
+    settings = {"reward": RewardConfig(disagreement=100.0, spread=500.0)}
     divided = play(script, 4, model=Doubtful, **settings)
     for number, (one, other) in enumerate(zip(alone[:3], divided, strict=False), start=1):
-        np.testing.assert_allclose(other[2], one[2] - number, rtol=1e-4)
+        np.testing.assert_allclose(other[2], one[2] - 1.5 * number, rtol=1e-4)
     assert endings(divided)[-1] == "DIVERGED" and jnp.isfinite(divided[-1][2])
     ended = play(script, 3, model=Doubtful, plausible_disagreement=0.025)
     assert endings(ended) == ["RUNNING", "RUNNING", "DIVERGED"]

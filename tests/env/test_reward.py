@@ -16,11 +16,12 @@ def value(**changes):
         "pitch": 0.0,
         "vertical_speed": 0.0,
         "disagreement": 0.0,
+        "spread": 0.0,
         "ending": Ending.RUNNING,
     }
     terms.update(changes)
     arrays = {name: jnp.asarray(x) for name, x in terms.items()}
-    return float(reward(RewardConfig(disagreement=100.0), **arrays))
+    return float(reward(RewardConfig(disagreement=100.0, spread=1000.0), **arrays))
 
 
 @pytest.mark.parametrize(
@@ -35,6 +36,7 @@ def value(**changes):
         ({"pitch": math.radians(45)}, -7.853982),
         ({"vertical_speed": -0.5}, -0.5),
         ({"disagreement": 0.02}, -2.0),
+        ({"spread": 0.003}, -3.0),
         ({"ending": Ending.GOAL}, 3000.0),
         ({"ending": Ending.STUCK}, -300.0),
         ({"ending": Ending.OFF_MAP}, -600.0),

@@ -12,7 +12,15 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from vertiwm_jax import devices
-from vertiwm_jax.dynamics import EMBEDDING_SHAPE, Dynamics, History, Params, disagreement, embedding
+from vertiwm_jax.dynamics import (
+    EMBEDDING_SHAPE,
+    Dynamics,
+    History,
+    Params,
+    disagreement,
+    embedding,
+    spread,
+)
 from vertiwm_jax.env import observation, route, tasks
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.reward import RewardConfig, reward
@@ -27,7 +35,7 @@ from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.reveal import RevealConfig
 
-_SETTLED_TOGETHER = 256  # vehicles, of which each has patches in every step
+_SETTLED_TOGETHER = 64  # vehicles on a device, of which each has patches in every step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +192,9 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         Enough to restore what was learned with such parameters, without settling anything.
         """
         routes = route.straight(self.config.route, terrain, tasks.goal)
-        starts, seen = jax.eval_shape(partial(_settle, self), dynamics, terrain, routes, tasks)
+        starts, seen = jax.eval_shape(
+            partial(_settle, self), dynamics, terrain, routes, tasks, jnp.arange(len(tasks.world))
+        )
         return _params(self, dynamics, terrain, routes, starts, seen)
 
     def start(
@@ -264,6 +274,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
             pitch=pitch,
             vertical_speed=climb / STEP_SECONDS,
             disagreement=jnp.where(plausible, apart, 0.0),
+            spread=jnp.where(plausible, spread(history), 0.0),
             ending=ending,
         )
         gain = jnp.where(running, gain, 0.0)
@@ -359,8 +370,13 @@ def _make_params(
         routes = route.straight(config.route, terrain, pool.goal)
     else:
         routes = route.plan(config.route, terrain, config.chassis, pool.world, pool.goal)
-    settle = devices.shared_out(partial(_settle, env), len(pool.world))
-    starts, start_observation = settle(dynamics, terrain, routes, pool)
+    # Not all at once: patches of thousands of vehicles fill gigabytes.
+    together = min(_SETTLED_TOGETHER * jax.device_count(), len(pool.world))
+    settle = devices.shared_out(partial(_settle, env), together)
+    numbered = pool, jnp.arange(len(pool.world))
+    starts, start_observation = devices.in_turns(
+        lambda some: settle(dynamics, terrain, routes, *some), numbered, together
+    )
     finite = np.all(np.isfinite(starts.vehicle.vector), axis=-1)
     if not finite.all():
         i = int(np.argmin(finite))
@@ -393,9 +409,15 @@ def _params(
 
 @partial(jax.jit, static_argnames="env")
 def _settle(
-    env: NavigationEnv, dynamics: Params, terrain: TerrainMap, routes: Routes, pool: Tasks
+    env: NavigationEnv,
+    dynamics: Params,
+    terrain: TerrainMap,
+    routes: Routes,
+    pool: Tasks,
+    numbers: jax.Array,
 ) -> tuple[NavigationState, jax.Array]:
-    """States and observations of vehicles at rest: leaves `[P, ...]`, `[P, O]`."""
+    """States and observations of vehicles at rest, leaves `[P, ...]` and `[P, O]`; numbers `[P]`
+    are of their routes."""
     standing = Command(jnp.float32(0), jnp.float32(0))
     action = env.config.action(standing)
 
@@ -431,7 +453,5 @@ def _settle(
         believed = dataclasses.replace(selected, belief=state.belief)
         return state, env._see(believed, routes.select(number), state)
 
-    # Not all at once: patches of thousands of vehicles fill gigabytes.
-    each = devices.spread(settle, (None, None, None, 0, 0), _SETTLED_TOGETHER)
-    numbers = jnp.arange(len(pool.world))
+    each = devices.spread(settle, (None, None, None, 0, 0))
     return each(dynamics, terrain, routes, pool, numbers)

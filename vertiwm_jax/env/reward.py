@@ -21,6 +21,7 @@ class RewardConfig:
     goal, stuck, failure: once, at the ending; failure is any other terminal ending.
     timed_out, timed_out_distance: once, and for each metre that is left then.
     disagreement: for each metre that the parts of a model disagree, each step.
+    spread: for each metre by which its gates spread where it goes, each step.
     """
 
     progress: float = 50.0
@@ -34,6 +35,7 @@ class RewardConfig:
     timed_out: float = 100.0
     timed_out_distance: float = 10.0
     disagreement: float = 0.0
+    spread: float = 0.0
 
 
 def reward(
@@ -46,12 +48,13 @@ def reward(
     pitch: jax.Array,
     vertical_speed: jax.Array,
     disagreement: jax.Array,
+    spread: jax.Array,
     ending: jax.Array,
 ) -> jax.Array:
     """`[...]` reward of one 0.1 s step.
 
     progress: m by which the cost to go fell; distance: m left; stalled: bool; roll, pitch: rad;
-    vertical_speed: m/s in the world frame; disagreement: m; ending: `Ending` codes.
+    vertical_speed: m/s in the world frame; disagreement, spread: m; ending: `Ending` codes.
     """
 
     def tilt_penalty(angle: jax.Array) -> jax.Array:
@@ -64,6 +67,7 @@ def reward(
         - config.tilt * (tilt_penalty(roll) + tilt_penalty(pitch))
         - config.vertical * jnp.abs(vertical_speed)
         - config.disagreement * disagreement
+        - config.spread * spread
         + ending_reward(config, ending, distance)
     )
 

@@ -56,6 +56,11 @@ def restore(
     return training.restore(Seeds(algorithm, seeds), env_params, folder)
 
 
+def prepare(algorithm: Algorithm[Any], env_params: Any, seeds: int, batch: int) -> None:
+    """Compiles what `train` runs; shapes of parameters are enough. batch: as there."""
+    training.compiled(Seeds(algorithm, seeds), env_params, batch)
+
+
 def train(
     algorithm: Algorithm[State],
     env_params: Any,

@@ -78,8 +78,16 @@ class Task:
 def training_environment(config: TaskConfig) -> tuple[Task, TerrainMap]:
     """What to train in, and the worlds held out for `test_environment`.
 
-    Maps that cannot be used, and tasks that cannot be driven on them, raise `ValueError`; weights
-    that cannot be read, `CheckpointError`.
+    Raises like `training_ground`; weights that cannot be read raise `CheckpointError`.
+    """
+    terrain, pool, held_out = training_ground(config)
+    return environment(config, config.model, terrain, pool, config.variation), held_out
+
+
+def training_ground(config: TaskConfig) -> tuple[TerrainMap, Tasks, TerrainMap]:
+    """The worlds to train on, tasks on them, and the worlds held out for `test_environment`.
+
+    Maps that cannot be used, and tasks that cannot be driven on them, raise `ValueError`.
     """
     navigation, scale = config.asked, config.driven.scale
     terrain, held_out = ground.grounds(config.ground, config.worlds, config.key("worlds"), scale)
@@ -87,7 +95,7 @@ def training_environment(config: TaskConfig) -> tuple[Task, TerrainMap]:
     tests = ground.test_tasks(config.ground, held_out)
     tasks.validate(tests, held_out, navigation.goal_radius, navigation.map_margin)
     pool = ground.training_tasks(config.ground, terrain, navigation.chassis, config.key("tasks"))
-    return environment(config, config.model, terrain, pool, config.variation), held_out
+    return terrain, pool, held_out
 
 
 def held_out(config: TaskConfig) -> TerrainMap:
