@@ -152,19 +152,19 @@ def train_and_report(config: TrainConfig) -> Path:
         terrain, pool, held_out = task.training_ground(config)
         dynamics, weights = task.dynamics(config, config.model)
         env = NavigationEnv(dynamics, config.asked, config.variation)
+        shapes = env.shapes(weights, terrain, pool)
     algorithm, schedule, seeds = config.algorithm(env), config.schedule, config.loop.seeds
     steps = schedule.collected * config.action_repeat
-    shapes = env.shapes(weights, terrain, pool)
     restored = restore(algorithm, shapes, config.resume, seeds) if config.resume else None
+    if not restored or restored[0] < schedule.iterations:
+        # Now, while there are no vehicles yet that fill the memory.
+        prepare(algorithm, shapes, seeds, schedule.shareable)
+    print(f"placing vehicles for {len(pool.world):,} tasks ...", flush=True)
+    with _on_usable_ground():
+        params = env.make_params(weights, terrain, pool)
     with Run.begin(config, config.name, restored[0] if restored else 0, config.wandb) as run:
         print(f"run folder {run.folder}", flush=True)
         print(f"training in {config.model} on {terrain.worlds} worlds", flush=True)
-        if not restored or restored[0] < schedule.iterations:
-            # Now, while there are no vehicles yet that fill the memory.
-            prepare(algorithm, shapes, seeds, schedule.shareable)
-        print(f"placing vehicles for {len(pool.world)} tasks ...", flush=True)
-        with _on_usable_ground():
-            params = env.make_params(weights, terrain, pool)
         key = config.key("training")
         state = train(
             algorithm,

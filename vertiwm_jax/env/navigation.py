@@ -189,8 +189,10 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
     def shapes(self, dynamics: Params, terrain: TerrainMap, tasks: Tasks) -> NavigationParams:
         """What `make_params` gives, but for the starts, of which only shapes are known.
 
-        Enough to restore what was learned with such parameters, without settling anything.
+        Enough to restore what was learned with such parameters, or to compile what will be, without
+        settling anything. Tasks that cannot be driven raise as there.
         """
+        _check(self, terrain, tasks)
         routes = route.straight(self.config.route, terrain, tasks.goal)
         starts, seen = jax.eval_shape(
             partial(_settle, self), dynamics, terrain, routes, tasks, jnp.arange(len(tasks.world))
@@ -364,8 +366,7 @@ def _make_params(
     env: NavigationEnv, dynamics: Params, terrain: TerrainMap, pool: Tasks
 ) -> NavigationParams:
     config = env.config
-    reveal.check(config.reveal, terrain)
-    pool = tasks.validate(pool, terrain, config.goal_radius, config.map_margin)
+    _check(env, terrain, pool)
     if config.reveal.partial:
         routes = route.straight(config.route, terrain, pool.goal)
     else:
@@ -387,6 +388,12 @@ def _make_params(
             f"{np.sum(~finite)} of {finite.size} tasks are so"
         )
     return _params(env, dynamics, terrain, routes, starts, start_observation)
+
+
+def _check(env: NavigationEnv, terrain: TerrainMap, pool: Tasks) -> None:
+    """`ValueError` names what cannot be revealed, or the first task that cannot be driven."""
+    reveal.check(env.config.reveal, terrain)
+    tasks.validate(pool, terrain, env.config.goal_radius, env.config.map_margin)
 
 
 def _params(
