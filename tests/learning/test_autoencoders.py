@@ -18,9 +18,9 @@ from vertiwm_jax.learning.autoencoders import (
 from vertiwm_jax.learning.fitting import FitConfig
 from vertiwm_jax.networks.encoder import TerrainEncoder
 from vertiwm_jax.runs import Run
+from vertiwm_jax.terrain import crop
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain import query
-from vertiwm_jax.terrain.query import PatchConfig
+from vertiwm_jax.terrain.crop import PatchConfig
 
 DRIVES = Path(__file__).parents[1] / "data" / "chrono_drives"
 CONFIG = AutoencoderConfig(batch=4, validation=8)
@@ -78,7 +78,7 @@ def test_errors_are_in_metres_and_pixels(data, params, reference, monkeypatch):
     places, right = data.validation, []
     for i in range(len(places.yaw)):
         world = ground.select(places.world[i])
-        rgb = query.patches(world, places.position[i], places.yaw[i]).rgb
+        rgb = crop.patches(world, places.position[i], places.yaw[i]).rgb
         concrete = np.isclose(rgb, ground.class_rgb[1] / 127.5 - 1, atol=1e-3).all(axis=-1)
         right.append(0.5 + concrete[:, 64:].sum() / concrete.size)
     assert float(found["colour_accuracy"]) == pytest.approx(np.mean(right), abs=1e-4)
@@ -98,7 +98,7 @@ def test_training_reconstructs_better_and_gives_encoders(data, params, tmp_path)
     chex.assert_trees_all_equal(fitting.load(run.folder, params), fitted)
 
     encoders = autoencoders.encoders(fitted)
-    patches = query.patches(
+    patches = crop.patches(
         data.terrain, data.places.position[0], data.places.yaw[0], CONFIG.patches
     )
     for channels, weights, patch in (

@@ -1,5 +1,3 @@
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,10 +6,8 @@ import pytest
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.classes import STANDARD
-from vertiwm_jax.terrain.query import PatchConfig
 
-MUD, CONCRETE, GRASS = (STANDARD.names.index(name) for name in ("mud", "concrete", "grass"))
-PAPER, RELATIVE = PatchConfig(), PatchConfig("vehicle", "bilinear")
+MUD, CONCRETE = STANDARD.names.index("mud"), STANDARD.names.index("concrete")
 
 
 @pytest.fixture(scope="module")
@@ -32,19 +28,6 @@ def terrain():
 
 
 surface_of = jax.jit(lambda terrain, world, xy: query.surface(terrain.select(world), xy))
-
-
-@partial(jax.jit, static_argnums=4)
-def patches_of(terrain, world, position, yaw, config=PAPER):
-    return query.patches(terrain.select(world), position, yaw, config)
-
-
-def bilinear(z, u, v):
-    """Heights between the four vertices around column u, row v, in double precision."""
-    c, r = np.minimum(u.astype(int), z.shape[1] - 2), np.minimum(v.astype(int), z.shape[0] - 2)
-    f, g = u - c, v - r
-    top, bottom = (z[i, c] * (1 - f) + z[i, c + 1] * f for i in (r, r + 1))
-    return top * (1 - g) + bottom * g
 
 
 def reference_surface(terrain, world, x, y):
@@ -68,119 +51,6 @@ def reference_surface(terrain, world, x, y):
     else:  # triangle bl, tr, tl
         height = bl + up * (tl - bl) + right * (tr - tl)
     return height, kind, float(terrain.friction[world, i, j])
-
-
-def reference_patches(terrain, world, x, y, yaw):
-    z, semantic = np.asarray(terrain.elevation[world], float), np.asarray(terrain.semantic[world])
-    x0, y0 = np.asarray(terrain.origin, float)
-    step = float(terrain.resolution)
-    elevation, rgb = np.zeros((128, 128)), np.zeros((128, 128, 3))
-    for row in range(128):
-        for column in range(128):
-            ahead, left = 6.35 - 0.1 * row, 6.35 - 0.1 * column
-            px = x + np.cos(yaw) * ahead - np.sin(yaw) * left
-            py = y + np.sin(yaw) * ahead + np.cos(yaw) * left
-            u = np.clip((px - x0) / step, 0, z.shape[1] - 1)
-            v = np.clip((y0 - py) / step, 0, z.shape[0] - 1)
-            elevation[row, column] = z[int(v + 0.5), int(u + 0.5)] / 16 * 2 - 1
-            i = min(int(v / (z.shape[0] - 1) * semantic.shape[0]), semantic.shape[0] - 1)
-            j = min(int(u / (z.shape[1] - 1) * semantic.shape[1]), semantic.shape[1] - 1)
-            rgb[row, column] = STANDARD.rgb[semantic[i, j]] / 255.0 * 2 - 1
-    return elevation, rgb
-
-
-@pytest.mark.parametrize("pose", [(1.3, 2.7, 0.6), (-6.0, 10.0, -2.2)])
-def test_patches_equal_a_plain_loop(terrain, pose):
-    x, y, yaw = pose
-    found = patches_of(terrain, 1, jnp.array([x, y, 0.0]), jnp.float32(yaw))
-    elevation, rgb = reference_patches(terrain, 1, x, y, yaw)
-    # Pixels on a rounding border may fall either way in float32.
-    assert np.mean(np.abs(found.elevation - elevation) > 1e-5) < 1e-3
-    assert np.mean(np.abs(found.rgb - rgb).max(-1) > 1e-5) < 1e-3
-
-
-@pytest.mark.parametrize("eighth", range(8))
-def test_patches_show_bump_and_colour_where_they_are(eighth):
-    """A bump 4 m ahead and a patch of concrete 4 m to the left, placed by heading."""
-    yaw = eighth * np.pi / 4
-    vehicle = np.array([3.0, -5.0])
-    forward, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
-    axis = np.arange(129) * 0.25 - 16
-    x, y = axis[None, :], -axis[:, None]
-    bump, spot = vehicle + 4 * forward, vehicle + 4 * left
-    elevation = 16 * np.exp(-((x - bump[0]) ** 2 + (y - bump[1]) ** 2))
-    cell = np.arange(128) * 0.25 - 15.875
-    near = np.hypot(cell[None, :] - spot[0], -cell[:, None] - spot[1]) < 0.8
-    terrain = terrain_map.build(elevation, np.where(near, CONCRETE, GRASS), resolution=0.25)
-
-    position = jnp.array([*vehicle, 0.0], jnp.float32)
-    found = patches_of(terrain, 0, position, jnp.float32(yaw))
-    row, column = np.unravel_index(np.argmax(found.elevation), (128, 128))
-    assert abs(row - 23.5) <= 2 and abs(column - 63.5) <= 2
-    coloured = np.argwhere(np.asarray(found.rgb)[..., 2] > 0)  # concrete alone is bluish
-    np.testing.assert_allclose(coloured.mean(0), [63.5, 23.5], atol=1.5)
-    assert len(coloured) == pytest.approx(np.pi * 8**2, rel=0.1)
-
-
-def test_patches_are_bounded_and_batch_over_worlds(terrain):
-    position = jnp.array([[0.0, 0.0, 0.0], [100.0, -100.0, 0.0], [-1e9, 3.0, 0.0]])
-    axes = (None, 0, 0, 0)
-    batched = jax.jit(jax.vmap(lambda t, w, p, a: query.patches(t.select(w), p, a), axes))
-    found = batched(terrain, jnp.array([0, 1, 2]), position, jnp.zeros(3))
-    assert found.elevation.shape == (3, 128, 128) and found.rgb.shape == (3, 128, 128, 3)
-    for world in range(3):
-        alone = patches_of(terrain, world, position[world], jnp.float32(0))
-        np.testing.assert_array_equal(found.elevation[world], alone.elevation)
-        np.testing.assert_array_equal(found.rgb[world], alone.rgb)
-    # Far off the map, every pixel is its nearest corner.
-    np.testing.assert_allclose(found.elevation[1], terrain.elevation[1, -1, -1] / 8 - 1, atol=1e-6)
-    assert np.abs(found.elevation).max() <= 1 and np.abs(found.rgb).max() <= 1
-
-
-@pytest.mark.parametrize("pose", [(np.nan, np.nan, 0.0), (0.0, 0.0, np.nan)])
-def test_nan_pose_sees_the_first_vertex(terrain, pose):
-    found = patches_of(terrain, 2, jnp.array([*pose[:2], 0.0]), jnp.float32(pose[2]))
-    np.testing.assert_allclose(found.elevation, terrain.elevation[2, 0, 0] / 8 - 1, atol=1e-6)
-    assert np.isfinite(found.rgb).all()
-
-
-def test_no_gradient_flows_from_patches_to_the_pose(terrain):
-    def total(position, yaw):
-        found = query.patches(terrain, position, yaw, RELATIVE)
-        return found.elevation.sum() + found.rgb.sum()
-
-    slopes = jax.grad(total, (0, 1))(jnp.array([1.0, 2.0, 1.5]), jnp.float32(0.3))
-    assert not any(np.any(slope) for slope in slopes)
-
-
-def test_bilinear_patches_relative_to_the_vehicle(terrain):
-    x, y, z, yaw = 2.3, 1.7, 1.25, -0.8
-    found = patches_of(terrain, 1, jnp.array([x, y, z]), jnp.float32(yaw), RELATIVE)
-    place = 6.35 - 0.1 * np.arange(128)
-    ahead, left = place[:, None], place[None, :]
-    px = x + np.cos(yaw) * ahead - np.sin(yaw) * left
-    py = y + np.sin(yaw) * ahead + np.cos(yaw) * left
-    u, v = np.clip((px + 7) / 0.5, 0, 40), np.clip((11 - py) / 0.5, 0, 32)
-    expected = (bilinear(np.asarray(terrain.elevation[1], float), u, v) - z) / 4
-    np.testing.assert_allclose(found.elevation, expected, atol=1e-5)
-    paper = patches_of(terrain, 1, jnp.array([x, y, z]), jnp.float32(yaw))
-    np.testing.assert_array_equal(found.rgb, paper.rgb)
-
-
-@pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
-def test_references_differ_by_the_height_of_the_vehicle_and_the_scale(terrain, interpolation):
-    position = jnp.array([2.0, 1.0, 1.5])
-    by_map, by_vehicle = (
-        patches_of(terrain, 0, position, 0.4, PatchConfig(reference, interpolation)).elevation
-        for reference in ("map", "vehicle")
-    )
-    np.testing.assert_allclose(4 * by_vehicle + 1.5, 8 * (by_map + 1), atol=1e-5)
-
-
-def test_ground_far_above_or_below_the_vehicle_is_cut_off(terrain):
-    for height, expected in ((30.0, -1), (-30.0, 1)):
-        found = patches_of(terrain, 0, jnp.array([0.0, 0.0, height]), 0.0, RELATIVE)
-        np.testing.assert_array_equal(found.elevation, expected)
 
 
 def test_surface_equals_the_definition(terrain):
@@ -237,11 +107,3 @@ def test_normal_stands_on_the_slope():
     up = query.normal(jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, -np.sqrt(3)]]))
     half = np.sqrt(0.5)
     np.testing.assert_allclose(up, [[0, 0, 1], [-half, 0, half], [0, 0.75**0.5, 0.5]], atol=1e-6)
-
-
-def test_footprint_must_fit_the_patch():
-    query.footprint_covered(2.4, 8.0)
-    with pytest.raises(ValueError, match=r"12.8 m .* found .*6\.9 m > 6\.4 m; keep the top speed"):
-        query.footprint_covered(2.4, 45.0)
-    with pytest.raises(ValueError, match="patch"):
-        query.footprint_covered(float("nan"), 4.0)

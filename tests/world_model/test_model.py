@@ -23,8 +23,8 @@ from vertiwm_jax.dynamics import disagreement, rollout
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.terrain import query
-from vertiwm_jax.terrain.query import PatchConfig
+from vertiwm_jax.terrain import crop
+from vertiwm_jax.terrain.crop import PatchConfig
 from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.model import ModelConfig, VertiWM
 from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception
@@ -179,8 +179,8 @@ def test_shared_encoders_are_those_of_the_transformer():
 
 def test_shared_patches_are_queried_once(monkeypatch):
     calls = []
-    plain = query.patches
-    monkeypatch.setattr(query, "patches", lambda *a: calls.append(a[-1]) or plain(*a))
+    plain = crop.patches
+    monkeypatch.setattr(crop, "patches", lambda *a: calls.append(a[-1]) or plain(*a))
     for model, expected in ((MODEL, 1), (replace(MODEL, nesam=SeeingBicycle(TAUGHT)), 2)):
         history = jax.eval_shape(model.init, PARAMS, TERRAIN, STATE)
         calls.clear()

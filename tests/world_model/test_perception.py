@@ -5,8 +5,8 @@ import pytest
 from world_model.examples import driving, one, rough
 
 from vertiwm_jax.networks.encoder import TerrainEncoder
-from vertiwm_jax.terrain import query
-from vertiwm_jax.terrain.query import PatchConfig
+from vertiwm_jax.terrain import crop
+from vertiwm_jax.terrain.crop import PatchConfig
 from vertiwm_jax.world_model.perception import Exteroception, Perception
 
 TERRAIN, STATE = rough(), driving()
@@ -27,7 +27,7 @@ def test_average_is_over_space_elevation_first():
 def test_perceives_what_its_encoders_make_of_the_patches_at_the_pose(config):
     sense = Exteroception(config)
     seen = sense.encode(PARAMS, sense.query(TERRAIN, STATE))
-    patches = query.patches(TERRAIN, STATE.position, STATE.rpy[2], config)
+    patches = crop.patches(TERRAIN, STATE.position, STATE.rpy[2], config)
     elevation = TerrainEncoder(1).apply(PARAMS.elevation, patches.elevation[..., None])
     semantic = TerrainEncoder(3).apply(PARAMS.semantic, patches.rgb)
     assert seen.elevation.shape == seen.semantic.shape == (16, 16, 18)

@@ -19,7 +19,7 @@ from world_model.examples import (
 
 from vertiwm_jax.dynamics import rollout, warm_up
 from vertiwm_jax.state import Command, VehicleState
-from vertiwm_jax.terrain.query import PatchConfig
+from vertiwm_jax.terrain.crop import PatchConfig
 from vertiwm_jax.world_model.perception import Exteroception
 from vertiwm_jax.world_model.sizes import BASE, PAPER
 from vertiwm_jax.world_model.specialist_network import WINDOW

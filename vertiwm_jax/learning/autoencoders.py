@@ -13,9 +13,9 @@ from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.networks.encoder import TerrainAutoencoder
 from vertiwm_jax.state import Patches
-from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain import crop, query
+from vertiwm_jax.terrain.crop import PATCH_PIXELS, RELIEF_METRES, PatchConfig
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.terrain.query import PATCH_PIXELS, RELIEF_METRES, PatchConfig
 from vertiwm_jax.world_model.perception import EncoderParams
 
 _ELEVATION, _SEMANTIC = TerrainAutoencoder(1), TerrainAutoencoder(3)
@@ -107,7 +107,7 @@ class AutoencoderProblem:
 
         def one(params: Params, terrain: TerrainMap, place: Places) -> jax.Array:
             terrain = terrain.select(place.world)
-            patches = query.patches(terrain, place.position, place.yaw, self.config.patches)
+            patches = crop.patches(terrain, place.position, place.yaw, self.config.patches)
             again = reconstruct(params, patches)
             elevation = jnp.mean((again.elevation - patches.elevation) ** 2)
             return elevation + jnp.mean((again.rgb - patches.rgb) ** 2)
@@ -129,7 +129,7 @@ class AutoencoderProblem:
 
         def one(params: Params, terrain: TerrainMap, place: Places) -> tuple[jax.Array, ...]:
             world = terrain.select(place.world)
-            patches = query.patches(world, place.position, place.yaw, config.patches)
+            patches = crop.patches(world, place.position, place.yaw, config.patches)
             again = reconstruct(params, patches)
             elevation = jnp.mean((again.elevation - patches.elevation) ** 2)
             colour = jnp.mean((again.rgb - patches.rgb) ** 2)

@@ -11,7 +11,7 @@ from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning.autoencoders import AutoencoderConfig, PatchData, Places, near
 from vertiwm_jax.networks import soil_predictor
 from vertiwm_jax.networks.soil_predictor import BOUNDS, SoilPredictor
-from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain import crop, query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
 from vertiwm_jax.world_model.perception import EncoderParams, Exteroception
@@ -54,7 +54,7 @@ class SoilProblem:
         """`[6]` differences at one place, zero on rigid ground, and 1 on soil."""
         world = terrain.select(place.world)
         exteroception = Exteroception(self.config.patches)
-        patches = query.patches(world, place.position, place.yaw, self.config.patches)
+        patches = crop.patches(world, place.position, place.yaw, self.config.patches)
         encoders = cast(EncoderParams, params["encoders"])
         latent = exteroception.encode(encoders, patches).semantic
         predicted = cast(Soil, _NETWORK.apply(params["soil"], latent, jnp.float32(0)))

@@ -35,9 +35,7 @@ class TerrainEncoder(nn.Module):
             (self.channels, CELL_PIXELS**2, LATENT_CHANNELS),
         )
         bias = self.param("cell_bias", nn.initializers.zeros, (LATENT_CHANNELS,))
-        # A plane at a time, so that pixels that were computed cell by cell stay where they are.
-        cells = (_cells(patch[..., i]) for i in range(self.channels))
-        latent = bias + sum(cell @ k for cell, k in zip(cells, kernel, strict=True))
+        latent = bias + _cells(patch) @ kernel.reshape(-1, LATENT_CHANNELS)
 
         coarse = nn.silu(nn.Conv(24, (2, 2), strides=2, padding="VALID")(latent))
         coarse = nn.silu(nn.Conv(23, (3, 3))(coarse))
@@ -119,11 +117,17 @@ def _cosine_modes(count: int) -> tuple[np.ndarray, np.ndarray]:
     return modes, (1.0 + i + j)[smoothest] / CELL_PIXELS
 
 
-def _cells(plane: jax.Array) -> jax.Array:
-    """`[..., 128, 128]` to the pixels of each cell, `[..., 16, 16, 64]`."""
-    *batch, h, w = plane.shape
-    cells = plane.reshape(*batch, h // CELL_PIXELS, CELL_PIXELS, w // CELL_PIXELS, CELL_PIXELS)
-    return jnp.swapaxes(cells, -3, -2).reshape(*batch, h // CELL_PIXELS, w // CELL_PIXELS, -1)
+def _cells(patch: jax.Array) -> jax.Array:
+    """`[..., 128, 128, C]` to the pixels of each cell, channel by channel, `[..., 16, 16, 64 C]`.
+
+    In the order in which pixels are computed, so that they stay where they are.
+    """
+    *batch, h, w, channels = patch.shape
+    h, w = h // CELL_PIXELS, w // CELL_PIXELS
+    cells = patch.reshape(*batch, h, CELL_PIXELS, w, CELL_PIXELS, channels)
+    first = len(batch)
+    order = *range(first), *(first + i for i in (0, 2, 4, 1, 3))
+    return cells.transpose(order).reshape(*batch, h, w, -1)
 
 
 def _depth_to_space(x: jax.Array, block: int) -> jax.Array:

@@ -10,9 +10,9 @@ from flax import struct
 from vertiwm_jax.dynamics import Dynamics, History, Params
 from vertiwm_jax.networks.encoder import TerrainEncoder
 from vertiwm_jax.state import Command, Patches, VehicleState
-from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain import crop
+from vertiwm_jax.terrain.crop import PATCH_PIXELS, PatchConfig
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.terrain.query import PATCH_PIXELS, PatchConfig
 from vertiwm_jax.world_model.batching import few_at_a_time
 
 _ELEVATION, _SEMANTIC = TerrainEncoder(1), TerrainEncoder(3)
@@ -37,7 +37,8 @@ class Perception:
     @property
     def averaged(self) -> jax.Array:
         """`[..., 36]` the mean of every channel over space, e of Eq. 5."""
-        return jnp.mean(self.latent, axis=(-3, -2))
+        means = (jnp.mean(x, axis=(-3, -2)) for x in (self.elevation, self.semantic))
+        return jnp.concatenate([*means], axis=-1)
 
 
 @struct.dataclass
@@ -89,7 +90,7 @@ class Exteroception:
 
     def query(self, terrain: TerrainMap, state: VehicleState) -> Patches:
         """The patches at one vehicle's pose, which counts as given: Q(M; sg(T))."""
-        return query.patches(terrain, state.position, state.rpy[2], self.patches)
+        return crop.patches(terrain, state.position, state.rpy[2], self.patches)
 
     def encode(self, params: EncoderParams, patches: Patches) -> Perception:
         """Patches to their latents (Eq. 2)."""

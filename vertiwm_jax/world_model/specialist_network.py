@@ -2,13 +2,17 @@
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 
 from vertiwm_jax.networks.encoder import LATENT_CHANNELS
 from vertiwm_jax.networks.transformer import KeyValueCache, Transformer
+from vertiwm_jax.world_model.perception import Perception
 from vertiwm_jax.world_model.sizes import TransformerSize
 
 WINDOW = 16
 """Tokens that a specialist remembers, of 0.1 s each."""
+Ground = Perception | jax.Array | None
+"""What a specialist is told of the ground: latents, an indicator `[..., 1]`, or nothing."""
 
 
 class SpecialistNetwork(nn.Module):
@@ -19,20 +23,20 @@ class SpecialistNetwork(nn.Module):
     def setup(self) -> None:
         size = self.size
         self.embed = nn.Dense(size.width)
-        self.reduce = nn.Dense(size.channels)
+        self.reduce = _Reduction(size.channels)
         self.embed_ground = nn.Dense(size.width, use_bias=False)
         self.transformer = Transformer(size.layers, size.width, size.heads, size.hidden, WINDOW)
         # Untrained, it changes nothing: the mean transition stays, or physics.
         self.head = nn.Dense(12, kernel_init=nn.initializers.zeros)
 
-    def __call__(self, features: jax.Array, ground: jax.Array | None) -> jax.Array:
-        """`[..., T, F]` and the ground `[..., T, ...]` to `[..., T, 12]`."""
+    def __call__(self, features: jax.Array, ground: Ground) -> jax.Array:
+        """`[..., T, F]` and the ground, leaves `[..., T, ...]`, to `[..., T, 12]`."""
         return self.head(self.transformer(self._tokens(features, ground)))
 
     def step(
-        self, features: jax.Array, ground: jax.Array | None, cache: KeyValueCache
+        self, features: jax.Array, ground: Ground, cache: KeyValueCache
     ) -> tuple[jax.Array, KeyValueCache]:
-        """`[..., F]` and the ground `[..., ...]` to `[..., 12]`, the last of `__call__`."""
+        """`[..., F]` and the ground, leaves `[...]`, to `[..., 12]`, the last of `__call__`."""
         token, cache = self.transformer.step(self._tokens(features, ground), cache)
         return self.head(token), cache
 
@@ -40,11 +44,25 @@ class SpecialistNetwork(nn.Module):
         """As `Transformer.empty_cache`."""
         return self.transformer.empty_cache(batch)
 
-    def _tokens(self, features: jax.Array, ground: jax.Array | None) -> jax.Array:
-        """ground: a latent `[..., 16, 16, 36]`, an indicator `[..., 1]`, or nothing."""
+    def _tokens(self, features: jax.Array, ground: Ground) -> jax.Array:
         tokens = self.embed(features)
         if ground is None:
             return tokens
-        if ground.shape[-1] == 2 * LATENT_CHANNELS:
+        if isinstance(ground, Perception):
             ground = self.reduce(ground).reshape(*tokens.shape[:-1], -1)
         return tokens + self.embed_ground(ground)
+
+
+class _Reduction(nn.Module):
+    """A `nn.Dense` on both latents, without a copy of them beside each other."""
+
+    channels: int
+
+    @nn.compact
+    def __call__(self, ground: Perception) -> jax.Array:
+        """`[..., 16, 16, channels]`."""
+        shape = 2 * LATENT_CHANNELS, self.channels
+        kernel = self.param("kernel", nn.linear.default_kernel_init, shape)
+        bias = self.param("bias", nn.initializers.zeros, shape[1:])
+        of_elevation, of_semantic = jnp.split(kernel, 2)
+        return ground.elevation @ of_elevation + ground.semantic @ of_semantic + bias

@@ -16,7 +16,7 @@ from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.normalisation import LOCAL, Normalisation
 from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception
 from vertiwm_jax.world_model.sizes import BASE, TransformerSize
-from vertiwm_jax.world_model.specialist_network import SpecialistNetwork
+from vertiwm_jax.world_model.specialist_network import Ground, SpecialistNetwork
 
 
 @struct.dataclass
@@ -57,7 +57,7 @@ class TransformerSpecialist:
         encoders, ground = None, None
         if self.terrain == "patches":
             encoders = self.exteroception.init_params(encoder_key)
-            ground = jnp.zeros((1, 16, 16, 2 * LATENT_CHANNELS))
+            ground = Perception(*jnp.zeros((2, 1, 16, 16, LATENT_CHANNELS)))
         elif self.terrain == "indicator":
             ground = jnp.zeros((1, 1))
         network = self._network.init(network_key, jnp.zeros((1, LOCAL.size + 2)), ground)
@@ -137,14 +137,12 @@ class TransformerSpecialist:
         state: VehicleState,
         command: Command,
         perception: Perception | None,
-    ) -> tuple[jax.Array, jax.Array | None]:
+    ) -> tuple[jax.Array, Ground]:
         """What the network reads: motion `[..., 10]` and the ground."""
         constants = params.normalisation
         parts = constants.state(state.vector), constants.command(command.vector)
-        ground = None
-        if perception is not None:
-            ground = perception.latent
-        elif self.terrain == "indicator":
+        ground = perception
+        if self.terrain == "indicator":
             below = query.surface(terrain, state.position[..., :2])
             soil = terrain.deformable[below.semantic]
             ground = soil[..., None].astype(jnp.float32)
