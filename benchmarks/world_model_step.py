@@ -48,8 +48,8 @@ def parts(batch: int) -> dict[str, Part]:
 
     def gate(history: Any, state: Any, command: Any, first: Any, second: Any) -> Any:
         proposals = (
-            Proposal.of(state, first, history.transformer.perception),
-            Proposal.of(state, second, history.nesam.perception),
+            Proposal.of(state, first, history.perception),
+            Proposal.of(state, second, history.perception),
         )
         context = fusion.context(state, command, *proposals, model.gate_terrain)
         alphas, hidden = model.weigh(params.gate, context, history.hidden)

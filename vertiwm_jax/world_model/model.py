@@ -74,7 +74,7 @@ class VertiWMParams:
 
 @struct.dataclass
 class VertiWMHistory:
-    """h of both specialists and the gate.
+    """h of both specialists and the gate; what both see alike is in the Transformer's alone.
 
     hidden: `[G, 64]` of the gates; zeros where a window of prediction starts, in the paper.
     coefficients: `[4]` alpha that led to the current state; 0.5 before the first step.
@@ -277,9 +277,14 @@ class VertiWM:
         by_transformer, transformer = self.transformer.propose(
             params.transformer, terrain, history.transformer, state, command
         )
-        by_nesam, nesam = self.nesam.propose(params.nesam, terrain, history.nesam, state, command)
-        first = Proposal.of(state, by_transformer, history.transformer.perception)
-        second = Proposal.of(state, by_nesam, history.nesam.perception)
+        kept = history.nesam.perception
+        seen = history.perception if self.encoders == "shared" else kept
+        by_nesam, nesam = self.nesam.propose(
+            params.nesam, terrain, replace(history.nesam, perception=seen), state, command
+        )
+        first = Proposal.of(state, by_transformer, history.perception)
+        second = Proposal.of(state, by_nesam, seen)
+        nesam = replace(nesam, perception=kept)
         return first, second, replace(history, transformer=transformer, nesam=nesam)
 
     def weigh(
@@ -310,7 +315,7 @@ class VertiWM:
         both = self.transformer.exteroception, self.nesam.exteroception
         if self.encoders == "shared":
             (by_transformer,) = both[0].look(encoders[:1], terrain, state)
-            by_nesam = by_transformer
+            by_nesam = None
         elif both[0] == both[1]:
             by_transformer, by_nesam = both[0].look(encoders, terrain, state)
         else:

@@ -52,13 +52,13 @@ class NesamHistory:
     """simulator: physical memory; cache: of the past tokens, None without the correction.
 
     physics: what physics alone had made of the current state, which tells what it missed.
-    perception: of the current state.
+    perception: of the current state; None in a model that keeps it elsewhere.
     """
 
     simulator: SimulatorHistory
     cache: KeyValueCache | None
     physics: VehicleState
-    perception: Perception
+    perception: Perception | None
 
 
 @dataclass(frozen=True)
@@ -197,11 +197,12 @@ class Nesam:
         return self.exteroception.look((params.encoders,), terrain, state)[0]
 
     def _ground(
-        self, params: NesamParams, terrain: TerrainMap, perception: Perception
+        self, params: NesamParams, terrain: TerrainMap, perception: Perception | None
     ) -> TerrainMap:
         """The map with the soils that physics is to use."""
         if self.soil == "map":
             return terrain
+        assert perception is not None, "without a look it cannot predict the soil"
         predicted = cast(Soil, _SOIL.apply(params.soil, perception.semantic, jnp.float32(0)))
         everywhere = jax.tree.map(
             lambda x: jnp.broadcast_to(x, terrain.deformable.shape), predicted
