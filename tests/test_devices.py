@@ -41,7 +41,7 @@ def two():
 
 def test_a_mesh_has_as_many_devices_as_divide_the_batch(two):
     assert jax.device_count() == 2 == two.size
-    assert devices.mesh(17).size == devices.mesh(8).size == devices.mesh(1).size == 1
+    assert devices.mesh(17).size == devices.mesh(4).size == devices.mesh(1).size == 1
 
 
 @pytest.mark.parametrize(("size", "at_a_time"), [(16, None), (16, 3), (7, None), (7, 2), (1, 5)])

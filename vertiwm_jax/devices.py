@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 AXIS = "devices"
 """The axis of the mesh."""
-FEWEST = 8
+FEWEST = 4
 """Rows of a batch that are worth a device of their own."""
 _PATIENCE = 7 * 24 * 3600  # seconds
 

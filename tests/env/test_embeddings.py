@@ -51,8 +51,10 @@ def test_an_observation_ends_with_the_ground_as_the_encoders_see_it(name, terrai
     eyes = config.transformer.exteroception
     expected = eyes.encode(params.transformer.encoders, eyes.query(terrain, state.vehicle)).latent
     assert float(jnp.std(expected)) > 0.1 and float(jnp.max(jnp.abs(expected))) < OBSERVATION_LIMIT
-    found = seen[OBSERVATION_SIZE:].reshape(EMBEDDING_SHAPE)
-    np.testing.assert_allclose(found, expected, atol=1e-4)
+    tiles = seen[OBSERVATION_SIZE:].reshape(4, 4, 4, 4, 36)
+    for row, column in np.ndindex(16, 16):
+        found = tiles[row // 4, column // 4, row % 4, column % 4]
+        np.testing.assert_allclose(found, expected[row, column], atol=1e-4)
 
 
 def test_seeing_does_not_change_how_a_model_moves(terrain):

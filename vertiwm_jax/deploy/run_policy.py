@@ -99,12 +99,11 @@ def _learned(about: About, weights: Weights, observation: np.ndarray) -> np.ndar
 
 
 def _compressed(about: About, weights: Weights, seen: np.ndarray) -> np.ndarray:
-    """The picture of the ground to `[B, 16]`: each tile of 4 x 4, then all tiles together."""
+    """The picture of the ground to `[B, 16]`: each of its tiles, then all of them together."""
     rows, columns, channels = about["network"]["embedding"]
     (kernel, bias), (together, last_bias) = _layers(weights, "Compressor_0")
-    shape = (-1, rows // 4, 4, columns // 4, 4 * channels)
-    picture, kernel = np.reshape(_part(about, seen, "embedding"), shape), np.split(kernel, 4)
-    tiles = np.tanh(sum(picture[:, :, row] @ kernel[row] for row in range(4)) + bias)
+    shape = (-1, rows * columns // 16, 16 * channels)
+    tiles = np.tanh(np.reshape(_part(about, seen, "embedding"), shape) @ kernel + bias)
     return np.tanh(np.reshape(tiles, (-1, len(together))) @ together + last_bias)
 
 

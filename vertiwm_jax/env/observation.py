@@ -14,7 +14,7 @@ from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.footprint import CROWN_SCALE, SLOPE_SCALE, TWIST_SCALE, footprint, places
 from vertiwm_jax.env.route import CLEARANCE, Routes
 from vertiwm_jax.env.termination import edge_distance
-from vertiwm_jax.networks.policy import Candidates
+from vertiwm_jax.networks.policy import Candidates, tiles
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -194,8 +194,11 @@ def observe(
 
 
 def with_embedding(observation: jax.Array, embedding: jax.Array) -> jax.Array:
-    """The observation of a policy that also sees the ground as encoders do, `EMBEDDING_SHAPE`."""
+    """The observation of a policy that also sees the ground as encoders do, `EMBEDDING_SHAPE`.
+
+    Tile by tile, so that networks, which read it many times, need not put it in that order.
+    """
     # What a model sees where it has diverged may be anything.
-    finite = jnp.nan_to_num(embedding.ravel())
+    finite = jnp.nan_to_num(tiles(embedding).ravel())
     clipped = jnp.clip(finite, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
     return jnp.concatenate([observation, clipped])

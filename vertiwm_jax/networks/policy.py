@@ -12,6 +12,7 @@ from flax import struct
 
 LOG_STD_BOUNDS = (-4.0, 1.0)
 """The range of the policy's log standard deviation, in units of half the action range."""
+_TILE = 4  # cells of a picture to a side
 
 
 @struct.dataclass
@@ -97,8 +98,8 @@ class Senses:
     """How networks read an observation; as it is, by default.
 
     candidates: actions that they weigh against each other.
-    image: shape `(h, w, c)` of what its last h w c numbers are a picture of, which each network
-        learns to compress to 16 numbers; h and w are multiples of 4.
+    image: shape `(h, w, c)` of a picture that its last h w c numbers are the `tiles` of, which each
+        network learns to compress to 16 numbers; h and w are multiples of 4.
     """
 
     candidates: Candidates | None = None
@@ -111,27 +112,32 @@ class Senses:
         """
         if self.image is None:
             return observation
-        pixels = math.prod(self.image)
-        picture = observation[..., -pixels:].reshape(*observation.shape[:-1], *self.image)
-        return jnp.concatenate([observation[..., :-pixels], Compressor()(picture)], axis=-1)
+        h, w, c = self.image
+        rest, seen = observation[..., : -h * w * c], observation[..., -h * w * c :]
+        seen = seen.reshape(*seen.shape[:-1], h * w // _TILE**2, _TILE**2 * c)
+        return jnp.concatenate([rest, Compressor()(seen)], axis=-1)
+
+
+def tiles(picture: jax.Array) -> jax.Array:
+    """`[..., h, w, c]` to its tiles of 4 x 4, `[..., h w / 16, 16 c]`, from the first row on."""
+    *batch, h, w, c = picture.shape
+    split = picture.reshape(*batch, h // _TILE, _TILE, w // _TILE, _TILE, c)
+    return jnp.swapaxes(split, -4, -3).reshape(*batch, -1, _TILE**2 * c)
 
 
 class Compressor(nn.Module):
-    """A picture of the ground to 16 numbers: each tile of 4 x 4 to 16, then all tiles together.
+    """The tiles of a picture of the ground to 16 numbers: each to 16, then all together.
 
     Matmuls of tiles and no convolutions, whose gradients take most of an iteration on a CPU; the
     features of the picture have seen their neighbourhood already.
     """
 
     @nn.compact
-    def __call__(self, picture: jax.Array) -> jax.Array:
-        """`[..., h, w, c]` to `[..., 16]` in [-1, 1]."""
+    def __call__(self, seen: jax.Array) -> jax.Array:
+        """`[..., T, F]` tiles to `[..., 16]` in [-1, 1]."""
         kernel_init = nn.initializers.orthogonal(math.sqrt(2))
-        *batch, h, w, c = picture.shape
-        tiles = picture.reshape(*batch, h // 4, 4, w // 4, 4, c)
-        tiles = jnp.swapaxes(tiles, -4, -3).reshape(*batch, h * w // 16, 16 * c)
-        x = nn.tanh(nn.Dense(16, kernel_init=kernel_init)(tiles))
-        return nn.tanh(nn.Dense(16, kernel_init=kernel_init)(x.reshape(*batch, -1)))
+        x = nn.tanh(nn.Dense(16, kernel_init=kernel_init)(seen))
+        return nn.tanh(nn.Dense(16, kernel_init=kernel_init)(x.reshape(*x.shape[:-2], -1)))
 
 
 class Attention(nn.Module):

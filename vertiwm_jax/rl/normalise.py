@@ -1,6 +1,7 @@
 """Running mean and variance, and the normalisation made from them."""
 
 import dataclasses
+import math
 from typing import Self
 
 import jax
@@ -30,10 +31,15 @@ class RunningStatistics:
 
     def update(self, samples: jax.Array) -> Self:
         """Adds `[B..., ...]` samples (any leading axes), by Chan et al. (1979), eq. 2.1."""
-        axes = tuple(range(samples.ndim - self.mean.ndim))
-        added = samples.size // self.mean.size
-        mean = jnp.mean(samples, axes)
-        variance = jnp.var(samples, axes)
+        batch = samples.shape[: samples.ndim - self.mean.ndim]
+        added = math.prod(batch)
+
+        def average(x: jax.Array) -> jax.Array:
+            # As a product, which a CPU computes several times as fast as sums over first axes.
+            return jnp.tensordot(jnp.ones(batch), x, axes=len(batch), precision="highest") / added
+
+        mean = average(samples)
+        variance = average((samples - mean) ** 2)
         total = self.count + added
         share = added / total
         delta = mean - self.mean

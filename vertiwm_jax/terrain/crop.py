@@ -132,10 +132,10 @@ def _places(
 
 def _can_be_coarse(terrain: TerrainMap) -> bool:
     """Whether there are 3 x 3 vertices and 2 x 2 classes at all, and all of them are known."""
-    return (
-        terrain.belief is None
-        and min(min(terrain.elevation.shape[1:]) - 3, min(terrain.semantic.shape[1:]) - 2) >= 0
-    )
+    vertices, classes = terrain.elevation.shape[1:], terrain.semantic.shape[1:]
+    if not all(isinstance(number, int) for number in vertices + classes):
+        return False  # An export takes maps of any size.
+    return terrain.belief is None and min(vertices) >= 3 and min(classes) >= 2
 
 
 def _is_coarse(terrain: TerrainMap) -> jax.Array:
