@@ -17,7 +17,13 @@ from vertiwm_jax.world_model.fusion import Proposal
 from vertiwm_jax.world_model.model import VertiWM
 
 Part = tuple[Callable[..., Any], tuple[Any, ...]]
-"""A function of vehicles, vmapped, and its arguments."""
+"""A function of the map and of vehicles, over which it is vmapped, and their arguments."""
+
+
+def over_vehicles(part: Part) -> Callable[..., Any]:
+    """The function compiled; a map that it closed over would be a constant of the program."""
+    function, arguments = part
+    return jax.jit(jax.vmap(function, (None, *(0 for _ in arguments[1:]))))
 
 
 def parts(batch: int) -> dict[str, Part]:
@@ -27,11 +33,12 @@ def parts(batch: int) -> dict[str, Part]:
     terrain, states, commands = drives(batch, 1)
     command = jax.tree.map(lambda x: x[:, 0], commands)
 
-    def step(history: Any, state: Any, command: Any) -> Any:
+    def step(terrain: Any, history: Any, state: Any, command: Any) -> Any:
         return model.step(params, terrain, history, state, command)
 
     start = jax.jit(jax.vmap(lambda state: model.init(params, terrain, state)))
-    state, history = jax.jit(jax.vmap(step))(start(states), states, command)
+    begun = (terrain, start(states), states, command)
+    state, history = over_vehicles((step, begun))(*begun)
 
     first, second = (
         jax.jit(jax.vmap(lambda m, s, c, one=one, p=p: one.propose(p, terrain, m, s, c)[0]))(
@@ -43,10 +50,10 @@ def parts(batch: int) -> dict[str, Part]:
         )
     )
 
-    def physics(memory: Any, state: Any, command: Any) -> Any:
+    def physics(terrain: Any, memory: Any, state: Any, command: Any) -> Any:
         return nesam.simulator.step(params.nesam.simulator, terrain, memory, state, command)
 
-    def gate(history: Any, state: Any, command: Any, first: Any, second: Any) -> Any:
+    def gate(_: Any, history: Any, state: Any, command: Any, first: Any, second: Any) -> Any:
         proposals = (
             Proposal.of(state, first, history.perception),
             Proposal.of(state, second, history.perception),
@@ -58,20 +65,20 @@ def parts(batch: int) -> dict[str, Part]:
     driven = (state, command)
     return {
         "map query and encoders": (
-            lambda state: transformer.exteroception.look((encoders,), terrain, state),
-            (state,),
+            lambda t, state: transformer.exteroception.look((encoders,), t, state),
+            (terrain, state),
         ),
         "Transformer": (
-            lambda m, s, c: transformer.propose(params.transformer, terrain, m, s, c),
-            (history.transformer, *driven),
+            lambda t, m, s, c: transformer.propose(params.transformer, t, m, s, c),
+            (terrain, history.transformer, *driven),
         ),
-        "NeSAM: physics": (physics, (history.nesam.simulator, *driven)),
+        "NeSAM: physics": (physics, (terrain, history.nesam.simulator, *driven)),
         "NeSAM: physics and network": (
-            lambda m, s, c: nesam.propose(params.nesam, terrain, m, s, c),
-            (history.nesam, *driven),
+            lambda t, m, s, c: nesam.propose(params.nesam, t, m, s, c),
+            (terrain, history.nesam, *driven),
         ),
-        "gate and fused motion": (gate, (history, *driven, first, second)),
-        "the whole step": (step, (history, *driven)),
+        "gate and fused motion": (gate, (terrain, history, *driven, first, second)),
+        "the whole step": (step, (terrain, history, *driven)),
     }
 
 
@@ -89,20 +96,18 @@ def cost(part: Part, batch: int) -> tuple[float, float]:
 
     The compiler counts the operations of a loop once: those of physics are of one sub-step.
     """
-    function, arguments = part
+    function, (terrain, *arguments) = part
     alone = jax.tree.map(lambda x: x[0], arguments)
-    flops = jax.jit(function).lower(*alone).compile().cost_analysis()["flops"]
-    leaves = jax.tree.leaves((arguments, jax.eval_shape(jax.vmap(function), *arguments)))
+    flops = jax.jit(function).lower(terrain, *alone).compile().cost_analysis()["flops"]
+    results = jax.eval_shape(over_vehicles(part), terrain, *arguments)
+    leaves = jax.tree.leaves((arguments, results))
     return flops, sum(leaf.size * leaf.dtype.itemsize for leaf in leaves) / batch
 
 
 def figures(batch: int) -> dict[str, Figures]:
     """A row for every part."""
     limits, chosen = ceilings(), parts(batch)
-    times = {
-        name: measure(jax.jit(jax.vmap(function)), *arguments)
-        for name, (function, arguments) in chosen.items()
-    }
+    times = {name: measure(over_vehicles(part), *part[1]) for name, part in chosen.items()}
     whole = times["the whole step"]["median_s"]
     rows: dict[str, Figures] = {
         "ceilings": {"GFLOP/s": limits["flops"] / 1e9, "GB/s": limits["bytes"] / 1e9}
