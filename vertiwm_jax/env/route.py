@@ -25,7 +25,7 @@ CLEARANCE = 0.3
 """Metres that are kept from obstacles."""
 _MOVES = np.array([(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)])
 _PLACES = np.array([0.0, 0.5, 1.0])  # of a move, where the ground is looked at
-_TOGETHER = 4  # goals, or worlds, that a device works at
+_TOGETHER = 1  # goal, or world, that a device works at: what it reads stays in its cache
 _ROUNDS = 16  # of value iteration, before it is looked whether anything still changes
 _REACH = 2  # cells, of the longest moves along an axis
 _NEAR = 1.5  # cells from a goal within which the way to it is straight
@@ -160,22 +160,22 @@ def _costs_to_go(
     near = jnp.max(jnp.abs(offset), axis=-1) <= _NEAR
     distance = jnp.linalg.norm(offset * _cell_size(terrain, cells), axis=-1)
 
-    # Padded all the time, so that all moves are read where the costs lie: no copies.
-    inner = (slice(_REACH, -_REACH),) * 2
     moves = np.concatenate([_MOVES, -_MOVES])
 
     def improve(cost: jax.Array, _: None) -> tuple[jax.Array, None]:
-        onward = [of_move + _window(cost, move) for move, of_move in zip(moves, costs, strict=True)]
-        best = functools.reduce(jnp.minimum, onward, cost[inner])
-        return cost.at[inner].set(best), None
+        around = _padded(cost)
+        onward = [
+            of_move + _window(around, move) for move, of_move in zip(moves, costs, strict=True)
+        ]
+        return functools.reduce(jnp.minimum, onward, cost), None
 
     def go_on(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         cost, _ = carry
         better, _ = jax.lax.scan(improve, cost, length=_ROUNDS)
         return better, jnp.any(better < cost)
 
-    begin = _padded(jnp.where(near, distance, jnp.inf)), jnp.bool(True)
-    return jax.lax.while_loop(lambda carry: carry[1], go_on, begin)[0][inner]
+    begin = jnp.where(near, distance, jnp.inf), jnp.bool(True)
+    return jax.lax.while_loop(lambda carry: carry[1], go_on, begin)[0]
 
 
 def _padded(values: jax.Array) -> jax.Array:

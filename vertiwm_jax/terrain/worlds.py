@@ -211,7 +211,11 @@ def _median_slope(heights: jax.Array) -> jax.Array:
     """Median slope (a tangent) of the lower triangles of all cells."""
     right = heights[1:, 1:] - heights[1:, :-1]
     up = heights[:-1, 1:] - heights[1:, 1:]
-    return jnp.median(jnp.hypot(right, up)) / RESOLUTION
+    # As integers, which XLA sorts four times as fast: the bits of floats that are not negative are
+    # in the same order.
+    bits = jax.lax.bitcast_convert_type(jnp.hypot(right, up), jnp.int32).ravel()
+    middle = jnp.sort(bits)[np.array([bits.size - 1, bits.size]) // 2]
+    return jnp.mean(jax.lax.bitcast_convert_type(middle, jnp.float32)) / RESOLUTION
 
 
 def _ridges(key: jax.Array, x: jax.Array, y: jax.Array, most: int) -> jax.Array:
