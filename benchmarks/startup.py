@@ -31,6 +31,7 @@ def phases(name: str) -> dict[str, float]:
     from vertiwm_jax.rl.loop import Seeds
 
     lap("import_s")
+    training.keep_compiled(None)  # in the folder of the environment
     config = configuration.load(PPOTraining, configuration.default_config(name))
     terrain, pool, _ = jax.block_until_ready(task.training_ground(config))
     lap("worlds_s")

@@ -107,6 +107,17 @@ def shared_out(function: Callable[..., T], batch: int) -> Callable[..., T]:
     return on_mesh
 
 
+def shapes(function: Callable[..., T], batch: int) -> Callable[..., T]:
+    """What `shared_out` of a function gives, of which only shapes are known; it is traced here."""
+
+    def on_mesh(*args: Any) -> T:
+        over = mesh(batch)
+        with jax.set_mesh(over):
+            return jax.eval_shape(function, *everywhere(over, args))
+
+    return on_mesh
+
+
 def in_turns(function: Callable[[Any], T], batch: Any, at_a_time: int) -> T:
     """What a function gives for all rows of leaves `[B, ...]`, of so many of which it is asked.
 

@@ -23,7 +23,6 @@ from vertiwm_jax.dynamics import disagreement, rollout
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.terrain import crop
 from vertiwm_jax.terrain.crop import PatchConfig
 from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.model import ModelConfig, VertiWM
@@ -178,14 +177,13 @@ def test_shared_encoders_are_those_of_the_transformer():
 
 
 def test_shared_patches_are_queried_once(monkeypatch):
-    calls = []
-    plain = crop.patches
-    monkeypatch.setattr(crop, "patches", lambda *a: calls.append(a[-1]) or plain(*a))
+    looks, plain = [], Exteroception.look
+    monkeypatch.setattr(Exteroception, "look", lambda *a: looks.append(a[0]) or plain(*a))
     for model, expected in ((MODEL, 1), (replace(MODEL, nesam=SeeingBicycle(TAUGHT)), 2)):
         history = jax.eval_shape(model.init, PARAMS, TERRAIN, STATE)
-        calls.clear()
+        looks.clear()
         jax.eval_shape(model.step, PARAMS, TERRAIN, history, STATE, COMMAND)
-        assert len(calls) == expected
+        assert len(looks) == expected
 
 
 def test_coefficients_are_in_the_history_and_vary_along_a_drive():

@@ -194,8 +194,13 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         """
         _check(self, terrain, tasks)
         routes = route.straight(self.config.route, terrain, tasks.goal)
-        starts, seen = jax.eval_shape(
-            partial(_settle, self), dynamics, terrain, routes, tasks, jnp.arange(len(tasks.world))
+        together, numbered = _settling(tasks)
+        some = jax.tree.map(lambda x: x[:together], numbered)
+        # As they will settle, so that it is traced only once.
+        shapes = devices.shapes(partial(_settle, self), together)
+        starts, seen = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct((len(tasks.world), *x.shape[1:]), x.dtype),
+            shapes(dynamics, terrain, routes, *some),
         )
         return _params(self, dynamics, terrain, routes, starts, seen)
 
@@ -371,10 +376,8 @@ def _make_params(
         routes = route.straight(config.route, terrain, pool.goal)
     else:
         routes = route.plan(config.route, terrain, config.chassis, pool.world, pool.goal)
-    # Not all at once: patches of thousands of vehicles fill gigabytes.
-    together = min(_SETTLED_TOGETHER * jax.device_count(), len(pool.world))
+    together, numbered = _settling(pool)
     settle = devices.shared_out(partial(_settle, env), together)
-    numbered = pool, jnp.arange(len(pool.world))
     starts, start_observation = devices.in_turns(
         lambda some: settle(dynamics, terrain, routes, *some), numbered, together
     )
@@ -394,6 +397,13 @@ def _check(env: NavigationEnv, terrain: TerrainMap, pool: Tasks) -> None:
     """`ValueError` names what cannot be revealed, or the first task that cannot be driven."""
     reveal.check(env.config.reveal, terrain)
     tasks.validate(pool, terrain, env.config.goal_radius, env.config.map_margin)
+
+
+def _settling(pool: Tasks) -> tuple[int, tuple[Tasks, jax.Array]]:
+    """How many vehicles settle at a time, and all tasks with the numbers of their routes."""
+    # Not all at once: patches of thousands of vehicles fill gigabytes.
+    together = min(_SETTLED_TOGETHER * jax.device_count(), len(pool.world))
+    return together, (pool, jnp.arange(len(pool.world)))
 
 
 def _params(

@@ -6,6 +6,7 @@ these alone and computes the pixels between them: gathers are what it does slowe
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import jax
@@ -56,6 +57,7 @@ class PatchConfig:
     interpolation: Literal["nearest", "bilinear"] = "nearest"
 
 
+@partial(jax.jit, static_argnames="config", inline=True)
 def patches(
     terrain: TerrainMap, position: jax.Array, yaw: jax.Array, config: PatchConfig = PatchConfig()
 ) -> Patches:

@@ -14,6 +14,7 @@ def few_at_a_time(function: Callable[..., Any], number: int) -> Callable[..., An
     where every vehicle needs hundreds of kB, all of it goes to memory and back between any two. For
     pure functions of arrays that no gradient flows through; other platforms take all at once.
     """
+    function = jax.jit(function, inline=True)  # Both ways to compute many share its trace.
     of_one = custom_vmap(function)
 
     @of_one.def_vmap

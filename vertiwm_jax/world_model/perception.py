@@ -1,5 +1,7 @@
 """What a model perceives of the ground at a pose: queried patches and their latents (Eq. 2)."""
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
@@ -77,16 +79,16 @@ class Exteroception:
         The map counts as given, like the pose: unless encoders are tuned, no gradient flows.
         """
 
-        def look(
-            encoders: tuple[EncoderParams, ...], terrain: TerrainMap, state: VehicleState
-        ) -> tuple[Perception, ...]:
-            patches = self.query(terrain, state)
-            return tuple(self.encode(params, patches) for params in encoders)
-
         if self.tune_encoders:
-            return look(encoders, terrain, state)
+            return self._look(encoders, terrain, state)
         given = jax.lax.stop_gradient((encoders, terrain, state))
-        return few_at_a_time(look, _TOGETHER)(*given)
+        return _few_looks(self)(*given)
+
+    def _look(
+        self, encoders: tuple[EncoderParams, ...], terrain: TerrainMap, state: VehicleState
+    ) -> tuple[Perception, ...]:
+        patches = self.query(terrain, state)
+        return tuple(self.encode(params, patches) for params in encoders)
 
     def query(self, terrain: TerrainMap, state: VehicleState) -> Patches:
         """The patches at one vehicle's pose, which counts as given: Q(M; sg(T))."""
@@ -99,6 +101,11 @@ class Exteroception:
         elevation = _ELEVATION.apply(params.elevation, patches.elevation[..., None])
         semantic = _SEMANTIC.apply(params.semantic, patches.rgb)
         return Perception(cast(jax.Array, elevation), cast(jax.Array, semantic))
+
+
+@functools.cache  # one function for each, so that what was traced is found again
+def _few_looks(exteroception: Exteroception) -> Callable[..., tuple[Perception, ...]]:
+    return few_at_a_time(exteroception._look, _TOGETHER)
 
 
 @struct.dataclass
