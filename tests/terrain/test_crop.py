@@ -131,12 +131,7 @@ def test_no_gradient_flows_from_patches_to_the_pose(terrain):
     assert not any(np.any(slope) for slope in slopes)
 
 
-COARSE, AS_COARSE_AS_CLASSES, FINE, FINE_CLASSES = (1.3, 4), (1.0, 1), (0.98, 4), (1.0, 2 / 3)
-
-
-@pytest.mark.parametrize(
-    "resolution, vertices_a_class", [COARSE, AS_COARSE_AS_CLASSES, FINE, FINE_CLASSES]
-)
+@pytest.mark.parametrize("resolution, vertices_a_class", [(1.3, 4), (0.98, 4), (1.0, 2 / 3)])
 @pytest.mark.parametrize(
     "pose",
     [
@@ -147,13 +142,11 @@ COARSE, AS_COARSE_AS_CLASSES, FINE, FINE_CLASSES = (1.3, 4), (1.0, 1), (0.98, 4)
     ],
 )
 def test_bilinear_patches_relative_to_the_vehicle(resolution, vertices_a_class, pose):
-    """Coarse maps are read by cells, others by pixels; near and beyond the edge, at any heading."""
+    """Near and beyond the edge, at any heading."""
     rng = np.random.default_rng(1)
     heights = rng.uniform(0, 3, (25, 33))
     kinds = rng.integers(0, 10, (int(24 / vertices_a_class), int(32 / vertices_a_class)))
     terrain = terrain_map.build(heights, kinds, resolution=resolution, origin=(-7.0, 11.0))
-    coarse = (resolution, vertices_a_class) in (COARSE, AS_COARSE_AS_CLASSES)
-    assert crop._is_coarse(terrain) == coarse
 
     x, y, z, yaw = pose
     found = patches_of(terrain, 0, jnp.array([x, y, z]), jnp.float32(yaw), RELATIVE)

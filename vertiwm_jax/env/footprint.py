@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from vertiwm_jax.env.chassis import Chassis
@@ -30,7 +31,9 @@ class Footprint:
     twist: jax.Array
 
 
-def places(chassis: Chassis, xy: jax.Array, heading: jax.Array) -> jax.Array:
+def places(
+    chassis: Chassis, xy: jax.Array | np.ndarray, heading: jax.Array | np.ndarray
+) -> jax.Array:
     """The middles and wheels of vehicles at `[..., 2]`, m, with `[...]` heading: `[5, ..., 2]`."""
     cos, sin = jnp.cos(heading), jnp.sin(heading)
     forward = jnp.stack([cos, sin], axis=-1) * chassis.wheelbase / 2

@@ -162,13 +162,14 @@ def observe(
     )
 
     # Written out: a matmul may round map coordinates to ten bits on an accelerator.
-    def at(points: np.ndarray) -> jax.Array:
+    def at(points: np.ndarray | jax.Array) -> jax.Array:
         x, y = points[..., 0], points[..., 1]
-        return state.position[:2] + jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+        east, north = state.position[:2]
+        return jnp.stack([east + (cos * x - sin * y), north + (sin * x + cos * y)], axis=-1)
 
     place, heading = poses_ahead(chassis)
     xy = at(place)
-    under = footprint(chassis, query.height(terrain, places(chassis, xy, yaw + heading)))
+    under = footprint(chassis, query.height(terrain, at(places(chassis, place, heading))))
     size = chassis.length + 2 * CLEARANCE, chassis.width + 2 * CLEARANCE
     blocked = obstacles.collides(terrain, xy, yaw + heading, *size)
     # Heights repeat beyond the edge of the map, which would look like the best of roads.

@@ -25,22 +25,38 @@ class TerrainEncoder(nn.Module):
 
     channels: int
 
-    @nn.compact
+    def setup(self) -> None:
+        shape = self.channels, CELL_PIXELS**2, LATENT_CHANNELS
+        self.cell_kernel = self.param("cell_kernel", _analysis, shape)
+        self.cell_bias = self.param("cell_bias", nn.initializers.zeros, (LATENT_CHANNELS,))
+        self.Conv_0 = _Halving(24)
+        self.Conv_1 = nn.Conv(23, (3, 3))
+        self.expand = nn.Dense(4 * LATENT_CHANNELS, kernel_init=nn.initializers.zeros)
+
     def __call__(self, patch: jax.Array) -> jax.Array:
         """`[..., 128, 128, channels]` in about [-1, 1] to `[..., 16, 16, 18]`."""
         assert patch.shape[-1] == self.channels, patch.shape
-        kernel = self.param(
-            "cell_kernel",
-            _analysis,
-            (self.channels, CELL_PIXELS**2, LATENT_CHANNELS),
-        )
-        bias = self.param("cell_bias", nn.initializers.zeros, (LATENT_CHANNELS,))
-        latent = bias + _cells(patch) @ kernel.reshape(-1, LATENT_CHANNELS)
+        return self.of_cells(_cells(patch) @ self.cell_kernel.reshape(-1, LATENT_CHANNELS))
 
-        coarse = nn.silu(nn.Conv(24, (2, 2), strides=2, padding="VALID")(latent))
-        coarse = nn.silu(nn.Conv(23, (3, 3))(coarse))
-        expand = nn.Dense(4 * LATENT_CHANNELS, kernel_init=nn.initializers.zeros, name="expand")
-        return latent + _depth_to_space(expand(coarse), 2)
+    def of_cells(self, projected: jax.Array) -> jax.Array:
+        """The same of what `cell_kernel` makes of each cell, `[..., 16, 16, 18]`."""
+        fours = _space_to_depth(projected, 2) + jnp.tile(self.cell_bias, 4)
+        coarse = nn.silu(self.Conv_1(nn.silu(self.Conv_0(fours))))
+        return _depth_to_space(fours + self.expand(coarse), 2)
+
+
+class _Halving(nn.Module):
+    """A convolution of 2 x 2 cells with strides of 2, as a matmul of what lies side by side."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, fours: jax.Array) -> jax.Array:
+        """`[..., h, w, 4 C]`, row by row of the 2 x 2 cells, to `[..., h, w, features]`."""
+        shape = 2, 2, fours.shape[-1] // 4, self.features
+        kernel = self.param("kernel", nn.linear.default_kernel_init, shape)
+        bias = self.param("bias", nn.initializers.zeros, shape[-1:])
+        return fours @ kernel.reshape(-1, self.features) + bias
 
 
 class TerrainDecoder(nn.Module):
@@ -135,3 +151,10 @@ def _depth_to_space(x: jax.Array, block: int) -> jax.Array:
     *batch, h, w, c = x.shape
     x = x.reshape(*batch, h, w, block, block, c // block**2)
     return jnp.swapaxes(x, -4, -3).reshape(*batch, h * block, w * block, -1)
+
+
+def _space_to_depth(x: jax.Array, block: int) -> jax.Array:
+    """`[..., h, w, c]` to `[..., h / block, w / block, c block**2]`, the inverse."""
+    *batch, h, w, c = x.shape
+    x = x.reshape(*batch, h // block, block, w // block, block, c)
+    return jnp.swapaxes(x, -4, -3).reshape(*batch, h // block, w // block, -1)

@@ -102,13 +102,14 @@ class Transformer(nn.Module):
     def _turn(self, position: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Positions `[...]` to the cosine and sine `[..., width / heads / 2]` of their rotations.
 
-        Frequencies fall geometrically from 1 rad a token and are whole cycles a period: angles
-        are exact in integers, and positions a period apart are one.
+        Frequencies fall geometrically from 1 rad a token and are whole cycles a period: positions
+        a period apart are one. From a table, or XLA would compute them for every head and layer.
         """
         fastest = self._period / (2 * math.pi)
-        cycles = np.rint(np.geomspace(fastest, 1.0, self.width // self.heads // 2)).astype(np.int32)
-        angle = position[..., None] * cycles % self._period * (2 * math.pi / self._period)
-        return jnp.cos(angle), jnp.sin(angle)
+        cycles = np.rint(np.geomspace(fastest, 1.0, self.width // self.heads // 2))
+        angle = 2 * math.pi / self._period * np.arange(self._period)[:, None] * cycles
+        cos, sin = jnp.asarray(np.cos(angle), jnp.float32), jnp.asarray(np.sin(angle), jnp.float32)
+        return cos[position % self._period], sin[position % self._period]
 
 
 class _Block(nn.Module):

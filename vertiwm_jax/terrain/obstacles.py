@@ -14,7 +14,7 @@ def collides(
 
     length: m along x of the body; width: m along y. A NaN pose touches nothing.
     """
-    return jnp.any(_gaps(terrain, xy, yaw, length, width) <= 0, axis=-1)
+    return gap(terrain, xy, yaw, length, width) <= 0
 
 
 def gap(
@@ -22,35 +22,30 @@ def gap(
 ) -> jax.Array:
     """`[...]` m between the rectangles of `collides` and the nearest obstacle; inf without any.
 
-    Seen along the axes of the map or of the body, whichever shows more, so never more than the
-    distance, and less past corners. Where they touch it is not positive, and says how far in.
-    """
-    return jnp.min(_gaps(terrain, xy, yaw, length, width), axis=-1, initial=jnp.inf)
-
-
-def _gaps(
-    terrain: TerrainMap, xy: jax.Array, yaw: jax.Array, length: float, width: float
-) -> jax.Array:
-    """`[..., N]` m to each obstacle, inf to rows not in use and to obstacles that are not known.
-
-    Separating-axis test on the two axes of the map and the two of the body.
+    Separating-axis test on the two axes of the map and the two of the body, whichever shows more:
+    never more than the distance, and less past corners. Where they touch it is not positive, and
+    says how far in. Obstacles that are not known are not there.
     """
     obstacles = terrain.obstacles[terrain.world]
-    offset = xy[..., None, :] - obstacles[:, :2]
-    half = obstacles[:, 2:4] / 2
-    cos, sin = jnp.cos(yaw)[..., None], jnp.sin(yaw)[..., None]
-    x, y = offset[..., 0], offset[..., 1]
-    wide, tall = half[:, 0], half[:, 1]
-    c, s = jnp.abs(cos), jnp.abs(sin)
-    on_map = jnp.maximum(
-        jnp.abs(x) - (wide + (c * length + s * width) / 2),
-        jnp.abs(y) - (tall + (s * length + c * width) / 2),
-    )
-    on_body = jnp.maximum(
-        jnp.abs(cos * x + sin * y) - (length / 2 + c * wide + s * tall),
-        jnp.abs(cos * y - sin * x) - (width / 2 + s * wide + c * tall),
-    )
     there = obstacles[:, 4] > 0
     if terrain.belief is not None:
         there &= query.known(terrain, obstacles[:, :2])
-    return jnp.where(there, jnp.maximum(on_map, on_body), jnp.inf)
+    x, y = xy[..., 0], xy[..., 1]
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    c, s = jnp.abs(cos), jnp.abs(sin)
+    reach = (c * length + s * width) / 2, (s * length + c * width) / 2
+
+    def nearer(nearest: jax.Array, one: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        (east, north, wide, tall, _), stands = one
+        dx, dy, wide, tall = x - east, y - north, wide / 2, tall / 2
+        on_map = jnp.maximum(jnp.abs(dx) - (wide + reach[0]), jnp.abs(dy) - (tall + reach[1]))
+        on_body = jnp.maximum(
+            jnp.abs(cos * dx + sin * dy) - (length / 2 + c * wide + s * tall),
+            jnp.abs(cos * dy - sin * dx) - (width / 2 + s * wide + c * tall),
+        )
+        apart = jnp.where(stands, jnp.maximum(on_map, on_body), jnp.inf)
+        return jnp.minimum(nearest, apart), None
+
+    # One obstacle after the other, for all rectangles at once.
+    none = jnp.full(jnp.broadcast_shapes(x.shape, cos.shape), jnp.inf)
+    return jax.lax.scan(nearer, none, (obstacles, there))[0]

@@ -12,7 +12,7 @@ from flax import struct
 from vertiwm_jax.dynamics import Dynamics, History, Params
 from vertiwm_jax.networks.encoder import TerrainEncoder
 from vertiwm_jax.state import Command, Patches, VehicleState
-from vertiwm_jax.terrain import crop
+from vertiwm_jax.terrain import cells, crop
 from vertiwm_jax.terrain.crop import PATCH_PIXELS, PatchConfig
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.batching import few_at_a_time
@@ -78,17 +78,31 @@ class Exteroception:
 
         The map counts as given, like the pose: unless encoders are tuned, no gradient flows.
         """
-
         if self.tune_encoders:
-            return self._look(encoders, terrain, state)
+            patches = self.query(terrain, state)
+            return tuple(self.encode(params, patches) for params in encoders)
         given = jax.lax.stop_gradient((encoders, terrain, state))
         return _few_looks(self)(*given)
 
     def _look(
         self, encoders: tuple[EncoderParams, ...], terrain: TerrainMap, state: VehicleState
     ) -> tuple[Perception, ...]:
-        patches = self.query(terrain, state)
-        return tuple(self.encode(params, patches) for params in encoders)
+        """`encode` of `query`, to rounding, but most pixels need not be drawn."""
+        of_elevation, of_semantic = (
+            jnp.concatenate([params["params"]["cell_kernel"] for params in kind], axis=-1)
+            for kind in ([p.elevation for p in encoders], [p.semantic for p in encoders])
+        )
+        projected = cells.projections(
+            terrain, state.position, state.rpy[2], self.patches, of_elevation[0], of_semantic
+        )
+        of_each = zip(*(jnp.split(x, len(encoders), axis=-1) for x in projected), strict=True)
+        return tuple(
+            Perception(
+                _of_cells(_ELEVATION, params.elevation, elevation),
+                _of_cells(_SEMANTIC, params.semantic, semantic),
+            )
+            for params, (elevation, semantic) in zip(encoders, of_each, strict=True)
+        )
 
     def query(self, terrain: TerrainMap, state: VehicleState) -> Patches:
         """The patches at one vehicle's pose, which counts as given: Q(M; sg(T))."""
@@ -101,6 +115,10 @@ class Exteroception:
         elevation = _ELEVATION.apply(params.elevation, patches.elevation[..., None])
         semantic = _SEMANTIC.apply(params.semantic, patches.rgb)
         return Perception(cast(jax.Array, elevation), cast(jax.Array, semantic))
+
+
+def _of_cells(encoder: TerrainEncoder, params: Any, projected: jax.Array) -> jax.Array:
+    return cast(jax.Array, encoder.apply(params, projected, method=TerrainEncoder.of_cells))
 
 
 @functools.cache  # one function for each, so that what was traced is found again
