@@ -1,5 +1,6 @@
 """Fast, differentiable world models for off-road reinforcement learning, in JAX."""
 
+import gc
 import sys
 
 from vertiwm_jax import devices, hosts
@@ -11,4 +12,6 @@ __version__ = "0.1.0"
 # JAX.
 if sys.argv[:1] == ["-m"]:
     devices.use_cores()
+    # Tracing makes many objects that stay: to look for garbage among them is a sixth of its time.
+    gc.set_threshold(100_000, 50, 50)
     hosts.join(hosts.command())
