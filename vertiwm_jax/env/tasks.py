@@ -75,7 +75,13 @@ def circle_tasks(
             f"circle_tasks: radius {radius:g} m does not fit on a map of "
             f"{2 * half[0]:g} x {2 * half[1]:g} m; choose one below {half.min():g} m"
         )
-    middle = jnp.asarray(terrain.origin + half * np.array([1, -1]), jnp.float32)
+    return _across(terrain, half * np.array([1, -1]), radius, pairs, sway)
+
+
+@jax.jit(static_argnames=("radius", "pairs", "sway"))
+def _across(terrain: TerrainMap, half: jax.Array, radius: float, pairs: int, sway: float) -> Tasks:
+    """Tasks across circles about the places that lie `half` m from the corners of all worlds."""
+    middle = terrain.origin + half
     evenly = 2 * jnp.pi * jnp.arange(pairs) / pairs
     offsets = sway * jnp.linspace(-1, 1, _SWAYS)
     turns = evenly[:, None] + offsets
@@ -89,8 +95,7 @@ def circle_tasks(
         return jnp.take_along_axis(turns, jnp.argmin(slopes, axis=1)[:, None], axis=1)[:, 0]
 
     world = jnp.arange(terrain.worlds, dtype=jnp.int32)
-    level = jax.jit(jax.vmap(most_level))
-    angle = level(world).ravel() if sway else jnp.tile(evenly, terrain.worlds)
+    angle = jax.vmap(most_level)(world).ravel() if sway else jnp.tile(evenly, terrain.worlds)
     start = on_circle(angle)
     return Tasks(
         world=jnp.repeat(world, pairs),
@@ -183,14 +188,19 @@ def place(terrain: TerrainMap, chassis: Chassis, xy: jax.Array, yaw: jax.Array) 
     return VehicleState(position, rpy, still, still)
 
 
+@jax.jit
+def _edge_distances(terrain: TerrainMap, tasks: Tasks) -> tuple[jax.Array, jax.Array]:
+    """Of starts and goals, m."""
+    return edge_distance(terrain, tasks.start), edge_distance(terrain, tasks.goal)
+
+
 def validate(tasks: Tasks, terrain: TerrainMap, goal_radius: float, margin: float) -> Tasks:
     """The same tasks; `ValueError` names the first that cannot be driven.
 
     Starts must lie `margin` m inside the map and farther than `goal_radius` m from the goal.
     """
     world = np.asarray(tasks.world)
-    start_edge = np.asarray(edge_distance(terrain, tasks.start))
-    goal_edge = np.asarray(edge_distance(terrain, tasks.goal))
+    start_edge, goal_edge = map(np.asarray, _edge_distances(terrain, tasks))
     distance = np.linalg.norm(np.asarray(tasks.goal - tasks.start), axis=-1)
     # Negated, so that NaN fails.
     checks = {
