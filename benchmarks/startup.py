@@ -42,7 +42,7 @@ def phases(name: str) -> dict[str, float]:
     lap("compile_s")
     params = jax.block_until_ready(env.make_params(weights, terrain, pool))
     lap("starts_s")
-    state = jax.jit(algorithm.init)(params, config.key("training"))
+    state = training.begin(algorithm, params, config.key("training"))
     iterate = training.compiled(algorithm, params, batch)
     params, state = devices.everywhere(devices.mesh(batch), (params, state))
     lap("weights_s")

@@ -25,6 +25,11 @@ AXIS = "devices"
 """The axis of the mesh."""
 FEWEST = 4
 """Rows of a batch that are worth a device of their own."""
+BRIEF = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
+"""Compiler options of programs that run only briefly: they compile in about half the time.
+
+Loops that depend on vector units run many times slower.
+"""
 _PATIENCE = 7 * 24 * 3600  # seconds
 
 
@@ -130,9 +135,15 @@ def in_turns(function: Callable[[Any], T], batch: Any, at_a_time: int) -> T:
         rows = slice(first, first + at_a_time)
         given = function(jax.tree.map(lambda x, rows=rows: x[rows], batch))
         if found is None:
-            found = jax.tree.map(lambda x: jnp.zeros((size, *x.shape[1:]), x.dtype), given)
+            found = _room(given, size)
         found = _with_rows(found, given, first)
     return cast(T, found)
+
+
+@partial(jax.jit, static_argnames="size")
+def _room(tree: T, size: int) -> T:
+    """Zeros `[size, ...]` for leaves `[..., ...]`."""
+    return jax.tree.map(lambda x: jnp.zeros((size, *x.shape[1:]), x.dtype), tree)
 
 
 @partial(jax.jit, donate_argnums=0)

@@ -146,6 +146,12 @@ def compiled(algorithm: Algorithm[State], data: Any, batch: int) -> Any:
     return _compiled(algorithm, devices.mesh(batch), kind, shapes)
 
 
+def begin(algorithm: Algorithm[State], data: Any, key: jax.Array) -> State:
+    """The state before the first iteration."""
+    options = devices.BRIEF | {"xla_backend_optimization_level": 0}  # It runs only once.
+    return jax.jit(algorithm.init, compiler_options=options)(data, key)
+
+
 def train(
     algorithm: Algorithm[State],
     data: Any,
@@ -166,7 +172,7 @@ def train(
     if restored:
         done, state = restored
     else:
-        done, state = 0, jax.jit(algorithm.init)(data, key)
+        done, state = 0, begin(algorithm, data, key)
     if done >= iterations:
         return state
 

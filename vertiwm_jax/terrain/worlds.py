@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax import devices
 from vertiwm_jax.terrain.classes import FIRST_DEFORMABLE, FRICTION_LIMITS, STANDARD
 from vertiwm_jax.terrain.map import ELEVATION_RANGE, TerrainMap
 from vertiwm_jax.terrain.soil import enlarged
@@ -127,7 +128,9 @@ def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> Terrai
         )
         for i in range(len(keys))
     ]
-    elevation, semantic, friction, obstacles = map(jnp.stack, zip(*parts, strict=True))
+    # By NumPy: to stack so many arrays would be a program for every number of worlds.
+    stacked = map(np.stack, zip(*jax.device_get(parts), strict=True))
+    elevation, semantic, friction, obstacles = map(jnp.asarray, stacked)
     return TerrainMap(
         elevation=elevation,
         semantic=semantic,
@@ -144,7 +147,7 @@ def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> Terrai
     )
 
 
-@jax.jit(static_argnames="relief")
+@jax.jit(static_argnames="relief", compiler_options=devices.BRIEF)
 def _ground(
     key: jax.Array, slope_deg: jax.Array, kind: jax.Array, relief: ReliefConfig
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -270,7 +273,7 @@ def _friction(key: jax.Array, semantic: jax.Array) -> jax.Array:
     return jnp.where(semantic < FIRST_DEFORMABLE, jnp.clip(drawn, *FRICTION_LIMITS), 0.0)
 
 
-@jax.jit(static_argnames=("rocks", "trees"))
+@jax.jit(static_argnames=("rocks", "trees"), compiler_options=devices.BRIEF)
 def _obstacles(key: jax.Array, rocks: int, trees: int, obstructed: float) -> jax.Array:
     """`[rocks + trees, 5]` boxes anywhere on the map but near the circle of starts and goals.
 
