@@ -37,6 +37,7 @@ def main() -> None:
     results = {"imported": {"most_MB": most()}}
     config = configuration.load(PPOTraining, configuration.default_config(chosen.config))
     terrain, pool, _ = task.training_ground(config)
+    devices.forget_programs()
     dynamics, weights = task.dynamics(config, config.model)
     env = NavigationEnv(dynamics, config.asked, config.variation)
     algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
@@ -48,7 +49,8 @@ def main() -> None:
         "terrain_MB": size(params.terrain),
         "starts_MB": size(params.starts),
     }
-    state = jax.jit(algorithm.init)(params, config.key("training"))
+    devices.forget_programs()
+    state = training.begin(algorithm, params, config.key("training"))
     iterate, mesh = training.compiled(algorithm, params, batch), devices.mesh(batch)
     params, state = devices.everywhere(mesh, (params, state))
     devices.release_memory()

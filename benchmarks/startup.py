@@ -34,6 +34,7 @@ def phases(name: str) -> dict[str, float]:
     training.keep_compiled(None)  # in the folder of the environment
     config = configuration.load(PPOTraining, configuration.default_config(name))
     terrain, pool, _ = jax.block_until_ready(task.training_ground(config))
+    devices.forget_programs()
     lap("worlds_s")
     dynamics, weights = task.dynamics(config, config.model)
     env = NavigationEnv(dynamics, config.asked, config.variation)
@@ -41,6 +42,7 @@ def phases(name: str) -> dict[str, float]:
     training.compiled(algorithm, env.shapes(weights, terrain, pool), batch)
     lap("compile_s")
     params = jax.block_until_ready(env.make_params(weights, terrain, pool))
+    devices.forget_programs()
     lap("starts_s")
     state = training.begin(algorithm, params, config.key("training"))
     iterate = training.compiled(algorithm, params, batch)

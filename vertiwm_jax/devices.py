@@ -161,6 +161,15 @@ def release_memory() -> None:
             ctypes.CDLL(None).malloc_trim(0)
 
 
+def forget_programs() -> None:
+    """Gives back the memory of all that was compiled, before what will not call it again.
+
+    What is held as compiled, as by `training.compiled`, stays.
+    """
+    jax.clear_caches()
+    release_memory()
+
+
 def spread(
     function: Callable[..., Any], in_axes: Sequence[int | None], at_a_time: int | None = None
 ) -> Callable[..., Any]:

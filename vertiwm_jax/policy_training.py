@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal, Protocol
 import jax
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import runs
+from vertiwm_jax import devices, runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.env.driver import Driver, Policy
 from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
@@ -150,6 +150,7 @@ def train_and_report(config: TrainConfig) -> Path:
     print("drawing worlds ...", flush=True)
     with _on_usable_ground():
         terrain, pool, held_out = task.training_ground(config)
+        devices.forget_programs()
         dynamics, weights = task.dynamics(config, config.model)
         env = NavigationEnv(dynamics, config.asked, config.variation)
         shapes = env.shapes(weights, terrain, pool)
@@ -162,6 +163,7 @@ def train_and_report(config: TrainConfig) -> Path:
     print(f"placing vehicles for {len(pool.world):,} tasks ...", flush=True)
     with _on_usable_ground():
         params = env.make_params(weights, terrain, pool)
+    devices.forget_programs()
     with Run.begin(config, config.name, restored[0] if restored else 0, config.wandb) as run:
         print(f"run folder {run.folder}", flush=True)
         print(f"training in {config.model} on {terrain.worlds} worlds", flush=True)
