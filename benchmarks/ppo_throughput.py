@@ -1,10 +1,13 @@
 """Transitions a second of PPO, all included: by default and on the paper's schedule.
 
 A transition is 0.1 s of driving. Beside them the algorithm alone, on an environment that costs
-nothing, with an observation of the same size.
+nothing, with an observation of the same size. Verti-WM is the one that comes along, or with
+`--size paper` one of the paper's size and with four encoders, of random weights, for none ships.
 """
 
+import tempfile
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,10 +19,13 @@ from benchmarks._harness import Figures, measure, parser, report
 from vertiwm_jax import config as configuration
 from vertiwm_jax import devices
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.mechanics.simulator import chrono_like
+from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
 from vertiwm_jax.rl.loop import Seeds
 from vertiwm_jax.rl.ppo import PPO
+from vertiwm_jax.world_model import model as world_model
 from vertiwm_jax.world_model.choice import ModelName
 
 
@@ -61,24 +67,35 @@ def iteration(ppo: PPO, params: Any, repeat: int = 1) -> Figures:
     return results
 
 
-def of_task(name: str, model: ModelName) -> Figures:
+def of_task(name: str, model: ModelName, weights: Path | None) -> Figures:
     """An iteration of the training that the configuration `name` describes, inside a model."""
     file = configuration.default_config(name)
-    config = replace(configuration.load(PPOTraining, file), model=model)
+    config = replace(configuration.load(PPOTraining, file), model=model, weights=weights)
     training, _ = task.training_environment(config)
     return iteration(config.algorithm(training.env), training.params, config.action_repeat)
+
+
+def untrained(folder: Path) -> Path:
+    """The folder, with a Verti-WM of the paper's size in it."""
+    config = world_model.ModelConfig(size="paper")
+    params = config.init_params(jax.random.key(0), chrono_like(hmmwv()))
+    world_model.save(folder, config, params)
+    return folder
 
 
 def main() -> None:
     arguments = parser(__doc__)
     arguments.add_argument("--configs", nargs="+", default=("ppo", "ppo_paper"))
     arguments.add_argument("--models", nargs="+", default=("builtin", "vertiwm"))
+    arguments.add_argument("--size", choices=("base", "paper"), default="base", help="of Verti-WM")
     chosen = arguments.parse_args()
     idle = environment.EnvParams(max_steps_in_episode=600)
     results = {"algorithm alone": iteration(PPO(IdleEnv(), PPOTraining().ppo), idle)}
-    for name in chosen.configs:
-        for model in chosen.models:
-            results[f"{name}, {model}"] = of_task(name, model)
+    with tempfile.TemporaryDirectory() as folder:
+        weights = untrained(Path(folder)) if chosen.size == "paper" else None
+        for name in chosen.configs:
+            for model in chosen.models:
+                results[f"{name}, {model}"] = of_task(name, model, weights)
     report("ppo_throughput", results, chosen.json)
 
 

@@ -181,6 +181,8 @@ def train_and_report(config: TrainConfig) -> Path:
         )
         policies = _policies(config, algorithm, params, state) | baselines(config.asked)
         _draw_learning(run, config)
+        del params, state  # Tests need the memory.
+        devices.forget_programs()
         with _on_usable_ground():
             test = task.test_environment(config, held_out)
         groups = report.drive(test.env, test.params, policies, config.key("testing"))
