@@ -63,8 +63,7 @@ def test_the_vehicle_follows_the_true_ground():
         drive(*bicycle_env(ground(hills()), TASK, config))
         for config in (REVEALED, NavigationConfig())
     )
-    # Two programs may round differently; ground that is guessed is decimetres off.
-    chex.assert_trees_all_close(hidden.vehicle, known.vehicle, atol=1e-5)
+    chex.assert_trees_all_equal(hidden.vehicle, known.vehicle)
 
 
 def test_sensors_that_see_everything_show_what_a_known_map_shows():

@@ -51,21 +51,18 @@ def advance_twist(
 
     inertia: principal moments about the centre of mass, kg m2; gravity: m/s2, body components.
     """
-    # One sum over all contacts: each sum by itself would be a kernel to compile.
-    nowhere, none = Vector.of(jnp.zeros((0, 3))), jnp.zeros(0)
-    contact = jax.tree.map(
-        lambda *parts: jnp.concatenate(parts),
-        ContactForce(nowhere, nowhere, none, none),
-        *contacts,
-    )
-    jacobian = jnp.stack([*contact.direction, *contact.arm.cross(contact.direction)])
-    weighted = seconds * contact.damping * jacobian
-    damped = jnp.sum(weighted[:, None] * jacobian, axis=-1)
-    matrix = damped + jnp.diag(jnp.stack([mass, mass, mass, *inertia]))
+    diagonal = [mass, mass, mass, *inertia]
     zero = jnp.zeros_like(mass)
-    weight = jnp.stack([*gravity.times(mass), zero, zero, zero])
-    rhs = seconds * (weight + jnp.sum(contact.force * jacobian, axis=-1))
-    change = _solve_spd([[matrix[i, j] for j in range(i + 1)] for i in range(6)], list(rhs))
+    rhs = [*gravity.times(mass), zero, zero, zero]
+    matrix = [[diagonal[i] if i == j else zero for j in range(i + 1)] for i in range(6)]
+    for contact in contacts:
+        jacobian = (*contact.direction, *contact.arm.cross(contact.direction))
+        for i in range(6):
+            rhs[i] = rhs[i] + jnp.sum(contact.force * jacobian[i], axis=-1)
+            weighted = seconds * contact.damping * jacobian[i]
+            for j in range(i + 1):
+                matrix[i][j] = matrix[i][j] + jnp.sum(weighted * jacobian[j], axis=-1)
+    change = _solve_spd(matrix, [seconds * r for r in rhs])
     linear, angular = Vector(*change[:3]), Vector(*change[3:])
     return Twist(twist.linear.plus(linear), twist.angular.plus(angular))
 
