@@ -377,7 +377,7 @@ def _make_params(
     else:
         routes = route.plan(config.route, terrain, config.chassis, pool.world, pool.goal)
     together, numbered = _settling(pool)
-    settle = devices.shared_out(partial(_settle_soon, env), together)
+    settle = devices.shared_out(partial(_settle, env), together)
     starts, start_observation = devices.in_turns(
         lambda some: settle(dynamics, terrain, routes, *some), numbered, together
     )
@@ -424,7 +424,7 @@ def _params(
     )
 
 
-@partial(jax.jit, static_argnames="env")
+@partial(jax.jit, static_argnames="env", compiler_options=devices.BRIEF)
 def _settle(
     env: NavigationEnv,
     dynamics: Params,
@@ -472,6 +472,3 @@ def _settle(
 
     each = devices.spread(settle, (None, None, None, 0, 0))
     return each(dynamics, terrain, routes, pool, numbers)
-
-
-_settle_soon = jax.jit(_settle, static_argnames="env", compiler_options=devices.BRIEF)
