@@ -12,7 +12,7 @@ from doors import refusal
 
 from vertiwm_jax import collect, evaluate, runs
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
-from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.observation import LAYOUT, OBSERVATION_SIZE
 from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.learning.dataset import Auxiliary

@@ -18,7 +18,7 @@ from vertiwm_jax import export, runs
 from vertiwm_jax.deploy import onnx_graph, run_policy, stablehlo
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env import observation, route
-from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZE
 from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.evaluation.controllers import LookAhead, StraightToGoal

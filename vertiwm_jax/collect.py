@@ -17,7 +17,7 @@ from vertiwm_jax import export, runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env.driver import Policy
-from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.evaluate import training
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig

@@ -14,7 +14,8 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import devices, runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.env.driver import Driver, Policy
-from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
+from vertiwm_jax.env.episode import NavigationParams
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.repeat import ActionRepeat, Controller
 from vertiwm_jax.evaluation import plots, report
 from vertiwm_jax.evaluation.controllers import REFERENCE, baselines

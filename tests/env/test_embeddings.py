@@ -11,7 +11,8 @@ from env.worlds import BICYCLE, SNOW, Scripted, hills, task
 
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
+from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_LIMIT, OBSERVATION_SIZE
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle

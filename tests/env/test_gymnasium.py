@@ -6,8 +6,8 @@ from env.worlds import bicycle_env, ground, hills, task
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.gymnasium import NavigationGymEnv, NavigationVectorEnv
-from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import Ending
 

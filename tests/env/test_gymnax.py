@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.gymnax import NAME
-from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.terrain.worlds import WorldConfig
 

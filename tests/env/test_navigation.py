@@ -9,7 +9,8 @@ from env.worlds import BICYCLE, Scripted, bicycle_env, ground, hills, step_of_ma
 from flax import struct
 
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
+from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.reward import RewardConfig
 from vertiwm_jax.env.tasks import circle_tasks

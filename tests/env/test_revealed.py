@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from env.worlds import bicycle_env, ground, hills, step_of_many, task
 
-from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.observation import LAYOUT, arcs_ahead
 from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import Ending

@@ -7,7 +7,8 @@ import pytest
 from env.worlds import BICYCLE, bicycle_env, ground, task
 
 from vertiwm_jax.dynamics import rollout
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
+from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.variation import Variation, VariationConfig
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like

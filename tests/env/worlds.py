@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv, NavigationParams
+from vertiwm_jax.env.episode import NavigationConfig, NavigationParams
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.mechanics.kinematic import BicycleParams, KinematicBicycle
 from vertiwm_jax.state import Command, VehicleState

@@ -6,7 +6,7 @@ from env.worlds import GRASS
 
 from vertiwm_jax.env import route
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.observation import observe
 from vertiwm_jax.evaluation.controllers import LookAhead
 from vertiwm_jax.state import VehicleState

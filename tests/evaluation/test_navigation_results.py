@@ -9,7 +9,7 @@ from env.worlds import bicycle_env, ground, hills
 from flax import struct
 from scipy.stats import binomtest
 
-from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation import navigation

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from env.worlds import SNOW, hills
 
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
+from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending

@@ -8,7 +8,8 @@ from env import worlds
 from env.worlds import BICYCLE, ground, task
 
 from vertiwm_jax.env import route
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
+from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.evaluation.controllers import StraightToGoal

@@ -7,7 +7,8 @@ import pytest
 from env.worlds import BICYCLE, bicycle_env, ground, task
 from flax import struct
 
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
+from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.repeat import ActionRepeat
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation import navigation

@@ -7,7 +7,8 @@ import pytest
 from env import worlds
 from env.worlds import BICYCLE, bicycle_env, ground, hills, task
 
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
+from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle

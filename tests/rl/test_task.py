@@ -7,7 +7,7 @@ import pytest
 from vertiwm_jax import config
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.rl import task
 from vertiwm_jax.rl.ground import GroundConfig

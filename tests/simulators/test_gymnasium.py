@@ -10,8 +10,9 @@ import pytest
 from env.worlds import SNOW, ground, hills, task
 from gymnasium.utils.env_checker import check_env
 
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.gymnasium import NavigationGymEnv
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.learning.dataset import Auxiliary

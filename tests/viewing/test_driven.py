@@ -2,7 +2,7 @@ import jax
 import numpy as np
 from env.worlds import bicycle_env, ground, hills, task
 
-from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.evaluation.controllers import StraightToGoal
 from vertiwm_jax.viewing import driven

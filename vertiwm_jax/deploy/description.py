@@ -10,8 +10,8 @@ import numpy as np
 
 import vertiwm_jax
 from vertiwm_jax.env import observation
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.footprint import Difficulty
-from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, LAYOUT, Part
 from vertiwm_jax.evaluation.controllers import REFERENCE, LookAhead, StraightToGoal
 from vertiwm_jax.networks.policy import SquashedActor

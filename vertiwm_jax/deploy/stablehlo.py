@@ -10,7 +10,7 @@ from jax import export
 
 from vertiwm_jax.env import observation
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.route import Routes
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.classes import STANDARD

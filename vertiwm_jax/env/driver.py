@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import jax
 from flax import struct
 
-from vertiwm_jax.env.navigation import NavigationParams, NavigationState
+from vertiwm_jax.env.episode import NavigationParams, NavigationState
 
 Memory = Any
 

@@ -10,7 +10,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from vertiwm_jax.env import picture
-from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
+from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.state import STEP_SECONDS
 
 FRAMES_PER_SECOND = round(1 / STEP_SECONDS)

@@ -12,7 +12,8 @@ from typing import Self
 import gymnax
 import jax
 
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv, NavigationParams
+from vertiwm_jax.env.episode import NavigationConfig, NavigationParams
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.tasks import random_tasks
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.worlds import WorldConfig

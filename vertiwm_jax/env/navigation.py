@@ -8,156 +8,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from gymnax.environments import environment, spaces
 
-from vertiwm_jax import devices
-from vertiwm_jax.dynamics import (
-    EMBEDDING_SHAPE,
-    Dynamics,
-    History,
-    Params,
-    disagreement,
-    embedding,
-    spread,
-)
-from vertiwm_jax.env import observation, route, tasks
-from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.reward import RewardConfig, reward
-from vertiwm_jax.env.route import RouteConfig, Routes
+from vertiwm_jax.dynamics import EMBEDDING_SHAPE, Dynamics, Params, disagreement, spread
+from vertiwm_jax.env import observation
+from vertiwm_jax.env.episode import NavigationConfig, NavigationParams, NavigationState, see
+from vertiwm_jax.env.reward import reward
+from vertiwm_jax.env.starts import Starts
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending, edge_distance, first_ending, is_terminal
 from vertiwm_jax.env.variation import Variation, VariationConfig
 from vertiwm_jax.networks.policy import Senses
-from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
+from vertiwm_jax.state import STEP_SECONDS, VehicleState
 from vertiwm_jax.terrain import crop, obstacles, query, reveal
-from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.terrain.reveal import RevealConfig
-
-_SETTLED_TOGETHER = 64  # vehicles on a device, of which each has patches in every step
-
-
-@dataclasses.dataclass(frozen=True)
-class NavigationConfig:
-    """What the task asks, static.
-
-    goal_radius: m from the goal, in three dimensions, at which it is reached.
-    horizon_seconds: time limit.
-    speed_range: commanded speed in m/s at actions -1 and 1; negative drives backwards.
-    map_margin: m from the edge of the map at which a vehicle is off it.
-    rollover_angle: rad of roll or of pitch.
-    stalled_speed, stuck_seconds: slower than this is stalled, for this long without a break stuck.
-    plausible_speed, plausible_height: m/s, and m from the ground, beyond which a model diverged.
-    plausible_disagreement: m by which its parts may disagree in a step before it has diverged.
-    settle_steps: steps of standing still before a start is handed out.
-    embeddings: whether an observation ends with the ground as the model's encoders see it.
-    route: how the way to the goal is found; it is straight where the map is not all known.
-    reveal: what sensors reveal of a map that is not known; by default all of it is.
-    """
-
-    goal_radius: float = 8.0
-    horizon_seconds: float = 60.0
-    speed_range: tuple[float, float] = (0.0, 6.0)
-    map_margin: float = 1.0
-    rollover_angle: float = np.pi / 3
-    stalled_speed: float = 0.3
-    stuck_seconds: float = 5.0
-    plausible_speed: float = 30.0
-    plausible_height: float = 4.0
-    plausible_disagreement: float = np.inf
-    settle_steps: int = 15
-    embeddings: bool = False
-    chassis: Chassis = dataclasses.field(default_factory=Chassis)
-    reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
-    route: RouteConfig = RouteConfig()
-    reveal: RevealConfig = RevealConfig()
-
-    def __post_init__(self) -> None:
-        if self.reveal.partial and self.embeddings:
-            raise ValueError(
-                "reveal.range: expected inf with embeddings, which show all of the map, "
-                f"found {self.reveal.range:g}"
-            )
-
-    def route_to(self, terrain: TerrainMap, goal: jax.Array) -> Routes:
-        """The route to the goal `[2]`, m, in the selected world; can be compiled."""
-        if self.reveal.partial:
-            return route.straight(self.route, terrain, goal[None])
-        return route.plan_one(self.route, terrain, self.chassis, goal)
-
-    def command(self, action: jax.Array) -> Command:
-        """`[..., 2]` action, clipped to [-1, 1], to the command it stands for."""
-        action = jnp.clip(action, -1.0, 1.0)
-        low, high = self.speed_range
-        speed = low + (action[..., 0] + 1) / 2 * (high - low)
-        return Command(speed, action[..., 1] * self.chassis.steering_limit)
-
-    def action(self, command: Command) -> jax.Array:
-        """The `[..., 2]` action of a command, clipped to [-1, 1]; the inverse of `command`."""
-        low, high = self.speed_range
-        speed = (command.speed - low) / (high - low) * 2 - 1
-        steering = command.steering / self.chassis.steering_limit
-        return jnp.clip(jnp.stack([speed, steering], -1), -1.0, 1.0)
-
-
-@struct.dataclass(kw_only=True)
-class NavigationState(environment.EnvState):
-    """One episode under way.
-
-    vehicle, history: the model's.
-    world: `[]` int32; goal: `[3]` m; route: `[]` int32, which of all routes leads there.
-    action: `[2]` the last one, in [-1, 1].
-    time: `[]` int32 steps done; stalled: `[]` int32 steps stalled without a break.
-    ending: `[]` int32 `Ending` code.
-    variation: how this episode differs from what the map says.
-    belief: what the vehicle has seen of its world; None where it knows all of the map.
-    """
-
-    vehicle: VehicleState
-    history: History
-    world: jax.Array
-    goal: jax.Array
-    route: jax.Array
-    action: jax.Array
-    stalled: jax.Array
-    ending: jax.Array
-    variation: Variation
-    belief: MapBelief | None = None
-
-
-@struct.dataclass(kw_only=True)
-class NavigationParams(environment.EnvParams):
-    """What an environment is run with: arrays, so that nothing here is compiled in.
-
-    dynamics: the model's parameters.
-    terrain: all worlds; routes: to all goals of the pool.
-    starts, start_observation: leaves `[P, ...]` and `[P, O]`, the pool that resets draw from.
-    max_steps_in_episode: `[]` int32.
-    """
-
-    dynamics: Params
-    terrain: TerrainMap
-    routes: Routes
-    starts: NavigationState
-    start_observation: jax.Array
-
-    @property
-    def pool_size(self) -> int:
-        """P, the number of starts."""
-        return self.start_observation.shape[0]
-
-    def cost_to_go(self, state: NavigationState) -> jax.Array:
-        """`[]` m of level ground that the way to the goal costs from where the vehicle is."""
-        routes, position = self.routes.select(state.route), state.vehicle.position
-        return routes.cost_to_go(self.terrain, position[:2])
-
-    def believed(self, state: NavigationState) -> TerrainMap:
-        """The world of an episode as far as its vehicle has seen it: what may drive it by."""
-        terrain = self.terrain.select(state.world)
-        if state.belief is None:
-            return terrain
-        return dataclasses.replace(terrain, belief=state.belief)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +48,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         `ValueError` names the first task that cannot be driven, or whose settled state is not
         finite.
         """
-        return _make_params(self, dynamics, terrain, tasks)
+        return self._starts.settled(dynamics, terrain, tasks)
 
     def shapes(self, dynamics: Params, terrain: TerrainMap, tasks: Tasks) -> NavigationParams:
         """What `make_params` gives, but for the starts, of which only shapes are known.
@@ -192,17 +56,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         Enough to restore what was learned with such parameters, or to compile what will be, without
         settling anything. Tasks that cannot be driven raise as there.
         """
-        _check(self, terrain, tasks)
-        routes = route.straight(self.config.route, terrain, tasks.goal)
-        together, numbered = _settling(tasks)
-        some = jax.tree.map(lambda x: x[:together], numbered)
-        # As they will settle, so that it is traced only once.
-        shapes = devices.shapes(partial(_settle, self), together)
-        starts, seen = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct((len(tasks.world), *x.shape[1:]), x.dtype),
-            shapes(dynamics, terrain, routes, *some),
-        )
-        return _params(self, dynamics, terrain, routes, starts, seen)
+        return self._starts.shapes(dynamics, terrain, tasks)
 
     def start(
         self, params: NavigationParams, index: jax.Array
@@ -318,7 +172,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         """`[O]` float32, see `observation.observe`, and the model's embedding of the ground."""
         del key, action
         routes = params.routes.select(state.route)
-        return self._see(params.believed(state), routes, state)
+        return see(self.config, params.believed(state), routes, state)
 
     def is_terminated(self, state: NavigationState, params: NavigationParams) -> jax.Array:
         """Whether the task itself is over."""
@@ -348,12 +202,9 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         """How networks should read observations."""
         return Senses(observation.ARCS, EMBEDDING_SHAPE if self.config.embeddings else None)
 
-    def _see(self, terrain: TerrainMap, routes: Routes, state: NavigationState) -> jax.Array:
-        chassis, vehicle = self.config.chassis, state.vehicle
-        seen = observation.observe(terrain, chassis, vehicle, state.goal, routes, state.action)
-        if not self.config.embeddings:
-            return seen
-        return observation.with_embedding(seen, embedding(state.history))
+    @property
+    def _starts(self) -> Starts:
+        return Starts(self.dynamics, self.config, self.variation)
 
     def _is_plausible(
         self, terrain: TerrainMap, vehicle: VehicleState, apart: jax.Array
@@ -365,110 +216,3 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
             & (jnp.abs(off_ground) <= self.config.plausible_height)
             & (apart <= self.config.plausible_disagreement)
         )
-
-
-def _make_params(
-    env: NavigationEnv, dynamics: Params, terrain: TerrainMap, pool: Tasks
-) -> NavigationParams:
-    config = env.config
-    _check(env, terrain, pool)
-    if config.reveal.partial:
-        routes = route.straight(config.route, terrain, pool.goal)
-    else:
-        routes = route.plan(config.route, terrain, config.chassis, pool.world, pool.goal)
-    together, numbered = _settling(pool)
-    settle = devices.shared_out(partial(_settle, env), together)
-    starts, start_observation = devices.in_turns(
-        lambda some: settle(dynamics, terrain, routes, *some), numbered, together
-    )
-    finite = np.all(np.isfinite(starts.vehicle.vector), axis=-1)
-    if not finite.all():
-        i = int(np.argmin(finite))
-        raise ValueError(
-            f"dynamics: expected a finite state after {config.settle_steps} steps of standing "
-            f"still, found {np.asarray(starts.vehicle.vector)[i]} in task {i} (world "
-            f"{int(pool.world[i])}, start {np.asarray(pool.start)[i].tolist()}); "
-            f"{np.sum(~finite)} of {finite.size} tasks are so"
-        )
-    return _params(env, dynamics, terrain, routes, starts, start_observation)
-
-
-def _check(env: NavigationEnv, terrain: TerrainMap, pool: Tasks) -> None:
-    """`ValueError` names what cannot be revealed, or the first task that cannot be driven."""
-    reveal.check(env.config.reveal, terrain)
-    tasks.validate(pool, terrain, env.config.goal_radius, env.config.map_margin)
-
-
-def _settling(pool: Tasks) -> tuple[int, tuple[Tasks, jax.Array]]:
-    """How many vehicles settle at a time, and all tasks with the numbers of their routes."""
-    # Not all at once: patches of thousands of vehicles fill gigabytes.
-    together = min(_SETTLED_TOGETHER * jax.device_count(), len(pool.world))
-    return together, (pool, jnp.arange(len(pool.world)))
-
-
-def _params(
-    env: NavigationEnv,
-    dynamics: Params,
-    terrain: TerrainMap,
-    routes: Routes,
-    starts: NavigationState,
-    start_observation: jax.Array,
-) -> NavigationParams:
-    return NavigationParams(
-        max_steps_in_episode=jnp.int32(round(env.config.horizon_seconds / STEP_SECONDS)),
-        dynamics=dynamics,
-        terrain=terrain,
-        routes=routes,
-        starts=starts,
-        start_observation=start_observation,
-    )
-
-
-@partial(jax.jit, static_argnames="env", compiler_options=devices.BRIEF)
-def _settle(
-    env: NavigationEnv,
-    dynamics: Params,
-    terrain: TerrainMap,
-    routes: Routes,
-    pool: Tasks,
-    numbers: jax.Array,
-) -> tuple[NavigationState, jax.Array]:
-    """States and observations of vehicles at rest, leaves `[P, ...]` and `[P, O]`; numbers `[P]`
-    are of their routes."""
-    standing = Command(jnp.float32(0), jnp.float32(0))
-    action = env.config.action(standing)
-
-    def settle(
-        dynamics: Params, terrain: TerrainMap, routes: Routes, task: Tasks, number: jax.Array
-    ) -> tuple[NavigationState, jax.Array]:
-        selected = terrain.select(task.world)
-        vehicle = tasks.place(selected, env.config.chassis, task.start, task.yaw)
-        goal = jnp.append(task.goal, query.height(selected, task.goal))
-
-        def advance(
-            carry: tuple[VehicleState, History], _: None
-        ) -> tuple[tuple[VehicleState, History], None]:
-            vehicle, history = carry
-            return env.dynamics.step(dynamics, selected, history, vehicle, standing), None
-
-        carry = vehicle, env.dynamics.init(dynamics, selected, vehicle)
-        (vehicle, history), _ = jax.lax.scan(advance, carry, length=env.config.settle_steps)
-        zero = jnp.int32(0)
-        state = NavigationState(
-            time=zero,
-            vehicle=vehicle,
-            history=history,
-            world=task.world,
-            goal=goal,
-            route=number,
-            action=action,
-            stalled=zero,
-            ending=zero,
-            variation=Variation.draw(env.variation, jax.random.key(0), action),
-            belief=reveal.begin(env.config.reveal, selected, vehicle.position, vehicle.rpy[2]),
-        )
-        believed = dataclasses.replace(selected, belief=state.belief)
-        return state, env._see(believed, routes.select(number), state)
-
-    each = devices.spread(settle, (None, None, None, 0, 0))
-    return each(dynamics, terrain, routes, pool, numbers)

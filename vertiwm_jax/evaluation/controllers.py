@@ -6,8 +6,8 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax.env.driver import Policy
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.footprint import Difficulty
-from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, GOAL, ROUTE_SCALE, arcs_ahead
 from vertiwm_jax.state import Command
 

@@ -13,7 +13,8 @@ from flax import struct
 
 from vertiwm_jax import devices
 from vertiwm_jax.env.driver import Driver, Policy, Reactive
-from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
+from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.state import STEP_SECONDS
 

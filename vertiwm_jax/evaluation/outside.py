@@ -10,7 +10,8 @@ import numpy as np
 
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env.driver import Driver, Memory, Policy, Reactive
-from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
+from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation import navigation

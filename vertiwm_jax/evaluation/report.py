@@ -13,7 +13,8 @@ import numpy as np
 
 from vertiwm_jax import runs
 from vertiwm_jax.env.driver import Driver, Policy
-from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams
+from vertiwm_jax.env.episode import NavigationParams
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.evaluation.navigation import (

@@ -10,7 +10,8 @@ from flax import struct
 
 from vertiwm_jax.dynamics import History, Params
 from vertiwm_jax.env.driver import Driver
-from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
+from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.repeat import ActionRepeat, corrected
 
 

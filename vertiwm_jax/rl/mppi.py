@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.env.navigation import NavigationParams, NavigationState
+from vertiwm_jax.env.episode import NavigationParams, NavigationState
 from vertiwm_jax.rl.imagining import Plan, around
 from vertiwm_jax.rl.open_loop import OpenLoop, OpenLoopConfig
 

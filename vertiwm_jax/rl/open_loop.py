@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.env.navigation import NavigationParams, NavigationState
+from vertiwm_jax.env.episode import NavigationParams, NavigationState
 from vertiwm_jax.rl.imagining import Future, Imagining, Plan
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.world_model.choice import Imagined

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from vertiwm_jax.env.navigation import NavigationParams, NavigationState
+from vertiwm_jax.env.episode import NavigationParams, NavigationState
 from vertiwm_jax.env.observation import distance_and_bearing
 from vertiwm_jax.env.reward import ending_reward
 from vertiwm_jax.env.termination import Ending, edge_distance

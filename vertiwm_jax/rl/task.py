@@ -9,7 +9,8 @@ import jax
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import tasks
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv, NavigationParams
+from vertiwm_jax.env.episode import NavigationConfig, NavigationParams
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.env.variation import VariationConfig

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
+from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax.env.episode import NavigationConfig, NavigationState
 from vertiwm_jax.env.gymnasium import NavigationGymEnv
-from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv, NavigationState
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.simulators import following
 from vertiwm_jax.simulators.following import Followed

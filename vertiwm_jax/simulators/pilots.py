@@ -9,7 +9,7 @@ import numpy as np
 
 from vertiwm_jax.env import observation
 from vertiwm_jax.env.driver import Policy
-from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.route import Routes
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.simulators.protocol import SimulatorError

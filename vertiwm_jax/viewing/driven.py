@@ -6,7 +6,8 @@ import jax
 import numpy as np
 
 from vertiwm_jax.env.driver import Driver, Memory, Policy, Reactive
-from vertiwm_jax.env.navigation import NavigationEnv, NavigationParams, NavigationState
+from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.evaluation.wheels import modelled
 from vertiwm_jax.state import STEP_SECONDS

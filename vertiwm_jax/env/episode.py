@@ -1,0 +1,160 @@
+"""What goal navigation asks, where an episode of it stands, and what all of them are run with."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from gymnax.environments import environment
+
+from vertiwm_jax.dynamics import (
+    History,
+    Params,
+    embedding,
+)
+from vertiwm_jax.env import observation, route
+from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env.reward import RewardConfig
+from vertiwm_jax.env.route import RouteConfig, Routes
+from vertiwm_jax.env.variation import Variation
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain.belief import MapBelief
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.reveal import RevealConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class NavigationConfig:
+    """What the task asks, static.
+
+    goal_radius: m from the goal, in three dimensions, at which it is reached.
+    horizon_seconds: time limit.
+    speed_range: commanded speed in m/s at actions -1 and 1; negative drives backwards.
+    map_margin: m from the edge of the map at which a vehicle is off it.
+    rollover_angle: rad of roll or of pitch.
+    stalled_speed, stuck_seconds: slower than this is stalled, for this long without a break stuck.
+    plausible_speed, plausible_height: m/s, and m from the ground, beyond which a model diverged.
+    plausible_disagreement: m by which its parts may disagree in a step before it has diverged.
+    settle_steps: steps of standing still before a start is handed out.
+    embeddings: whether an observation ends with the ground as the model's encoders see it.
+    route: how the way to the goal is found; it is straight where the map is not all known.
+    reveal: what sensors reveal of a map that is not known; by default all of it is.
+    """
+
+    goal_radius: float = 8.0
+    horizon_seconds: float = 60.0
+    speed_range: tuple[float, float] = (0.0, 6.0)
+    map_margin: float = 1.0
+    rollover_angle: float = np.pi / 3
+    stalled_speed: float = 0.3
+    stuck_seconds: float = 5.0
+    plausible_speed: float = 30.0
+    plausible_height: float = 4.0
+    plausible_disagreement: float = np.inf
+    settle_steps: int = 15
+    embeddings: bool = False
+    chassis: Chassis = dataclasses.field(default_factory=Chassis)
+    reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
+    route: RouteConfig = RouteConfig()
+    reveal: RevealConfig = RevealConfig()
+
+    def __post_init__(self) -> None:
+        if self.reveal.partial and self.embeddings:
+            raise ValueError(
+                "reveal.range: expected inf with embeddings, which show all of the map, "
+                f"found {self.reveal.range:g}"
+            )
+
+    def route_to(self, terrain: TerrainMap, goal: jax.Array) -> Routes:
+        """The route to the goal `[2]`, m, in the selected world; can be compiled."""
+        if self.reveal.partial:
+            return route.straight(self.route, terrain, goal[None])
+        return route.plan_one(self.route, terrain, self.chassis, goal)
+
+    def command(self, action: jax.Array) -> Command:
+        """`[..., 2]` action, clipped to [-1, 1], to the command it stands for."""
+        action = jnp.clip(action, -1.0, 1.0)
+        low, high = self.speed_range
+        speed = low + (action[..., 0] + 1) / 2 * (high - low)
+        return Command(speed, action[..., 1] * self.chassis.steering_limit)
+
+    def action(self, command: Command) -> jax.Array:
+        """The `[..., 2]` action of a command, clipped to [-1, 1]; the inverse of `command`."""
+        low, high = self.speed_range
+        speed = (command.speed - low) / (high - low) * 2 - 1
+        steering = command.steering / self.chassis.steering_limit
+        return jnp.clip(jnp.stack([speed, steering], -1), -1.0, 1.0)
+
+
+@struct.dataclass(kw_only=True)
+class NavigationState(environment.EnvState):
+    """One episode under way.
+
+    vehicle, history: the model's.
+    world: `[]` int32; goal: `[3]` m; route: `[]` int32, which of all routes leads there.
+    action: `[2]` the last one, in [-1, 1].
+    time: `[]` int32 steps done; stalled: `[]` int32 steps stalled without a break.
+    ending: `[]` int32 `Ending` code.
+    variation: how this episode differs from what the map says.
+    belief: what the vehicle has seen of its world; None where it knows all of the map.
+    """
+
+    vehicle: VehicleState
+    history: History
+    world: jax.Array
+    goal: jax.Array
+    route: jax.Array
+    action: jax.Array
+    stalled: jax.Array
+    ending: jax.Array
+    variation: Variation
+    belief: MapBelief | None = None
+
+
+@struct.dataclass(kw_only=True)
+class NavigationParams(environment.EnvParams):
+    """What an environment is run with: arrays, so that nothing here is compiled in.
+
+    dynamics: the model's parameters.
+    terrain: all worlds; routes: to all goals of the pool.
+    starts, start_observation: leaves `[P, ...]` and `[P, O]`, the pool that resets draw from.
+    max_steps_in_episode: `[]` int32.
+    """
+
+    dynamics: Params
+    terrain: TerrainMap
+    routes: Routes
+    starts: NavigationState
+    start_observation: jax.Array
+
+    @property
+    def pool_size(self) -> int:
+        """P, the number of starts."""
+        return self.start_observation.shape[0]
+
+    def cost_to_go(self, state: NavigationState) -> jax.Array:
+        """`[]` m of level ground that the way to the goal costs from where the vehicle is."""
+        routes, position = self.routes.select(state.route), state.vehicle.position
+        return routes.cost_to_go(self.terrain, position[:2])
+
+    def believed(self, state: NavigationState) -> TerrainMap:
+        """The world of an episode as far as its vehicle has seen it: what may drive it by."""
+        terrain = self.terrain.select(state.world)
+        if state.belief is None:
+            return terrain
+        return dataclasses.replace(terrain, belief=state.belief)
+
+
+def see(
+    config: NavigationConfig, terrain: TerrainMap, routes: Routes, state: NavigationState
+) -> jax.Array:
+    """`[O]` float32, see `observation.observe`, and the model's embedding of the ground.
+
+    terrain: as far as the vehicle has seen it; routes: with that to its goal selected.
+    """
+    chassis, vehicle = config.chassis, state.vehicle
+    seen = observation.observe(terrain, chassis, vehicle, state.goal, routes, state.action)
+    if not config.embeddings:
+        return seen
+    return observation.with_embedding(seen, embedding(state.history))

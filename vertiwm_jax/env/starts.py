@@ -1,0 +1,154 @@
+"""Starts of episodes: vehicles placed on the ground, settled by the model, routes planned."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vertiwm_jax import devices
+from vertiwm_jax.dynamics import (
+    Dynamics,
+    History,
+    Params,
+)
+from vertiwm_jax.env import route, tasks
+from vertiwm_jax.env.episode import NavigationConfig, NavigationParams, NavigationState, see
+from vertiwm_jax.env.route import Routes
+from vertiwm_jax.env.tasks import Tasks
+from vertiwm_jax.env.variation import Variation, VariationConfig
+from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
+from vertiwm_jax.terrain import query, reveal
+from vertiwm_jax.terrain.map import TerrainMap
+
+_TOGETHER = 64  # vehicles on a device, of which each has patches in every step
+
+
+@dataclasses.dataclass(frozen=True)
+class Starts:
+    """How the pool of starts of an environment is made; static.
+
+    dynamics, config, variation: the environment's.
+    """
+
+    dynamics: Dynamics
+    config: NavigationConfig
+    variation: VariationConfig
+
+    def settled(self, weights: Params, terrain: TerrainMap, pool: Tasks) -> NavigationParams:
+        """As `NavigationEnv.make_params`."""
+        config = self.config
+        self._check(terrain, pool)
+        if config.reveal.partial:
+            routes = route.straight(config.route, terrain, pool.goal)
+        else:
+            routes = route.plan(config.route, terrain, config.chassis, pool.world, pool.goal)
+        together, numbered = _in_turns(pool)
+        settle = devices.shared_out(partial(_settle, self), together)
+        states, seen = devices.in_turns(
+            lambda some: settle(weights, terrain, routes, *some), numbered, together
+        )
+        finite = np.all(np.isfinite(states.vehicle.vector), axis=-1)
+        if not finite.all():
+            i = int(np.argmin(finite))
+            raise ValueError(
+                f"dynamics: expected a finite state after {config.settle_steps} steps of standing "
+                f"still, found {np.asarray(states.vehicle.vector)[i]} in task {i} (world "
+                f"{int(pool.world[i])}, start {np.asarray(pool.start)[i].tolist()}); "
+                f"{np.sum(~finite)} of {finite.size} tasks are so"
+            )
+        return self._params(weights, terrain, routes, states, seen)
+
+    def shapes(self, weights: Params, terrain: TerrainMap, pool: Tasks) -> NavigationParams:
+        """As `NavigationEnv.shapes`."""
+        self._check(terrain, pool)
+        routes = route.straight(self.config.route, terrain, pool.goal)
+        together, numbered = _in_turns(pool)
+        some = jax.tree.map(lambda x: x[:together], numbered)
+        # As they will settle, so that it is traced only once.
+        shapes = devices.shapes(partial(_settle, self), together)
+        states, seen = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct((len(pool.world), *x.shape[1:]), x.dtype),
+            shapes(weights, terrain, routes, *some),
+        )
+        return self._params(weights, terrain, routes, states, seen)
+
+    def _check(self, terrain: TerrainMap, pool: Tasks) -> None:
+        """`ValueError` names what cannot be revealed, or the first task that cannot be driven."""
+        reveal.check(self.config.reveal, terrain)
+        tasks.validate(pool, terrain, self.config.goal_radius, self.config.map_margin)
+
+    def _params(
+        self,
+        weights: Params,
+        terrain: TerrainMap,
+        routes: Routes,
+        states: NavigationState,
+        seen: jax.Array,
+    ) -> NavigationParams:
+        return NavigationParams(
+            max_steps_in_episode=jnp.int32(round(self.config.horizon_seconds / STEP_SECONDS)),
+            dynamics=weights,
+            terrain=terrain,
+            routes=routes,
+            starts=states,
+            start_observation=seen,
+        )
+
+
+def _in_turns(pool: Tasks) -> tuple[int, tuple[Tasks, jax.Array]]:
+    """How many vehicles settle at a time, and all tasks with the numbers of their routes."""
+    # Not all at once: patches of thousands of vehicles fill gigabytes.
+    together = min(_TOGETHER * jax.device_count(), len(pool.world))
+    return together, (pool, jnp.arange(len(pool.world)))
+
+
+@partial(jax.jit, static_argnames="starts", compiler_options=devices.BRIEF)
+def _settle(
+    starts: Starts,
+    dynamics: Params,
+    terrain: TerrainMap,
+    routes: Routes,
+    pool: Tasks,
+    numbers: jax.Array,
+) -> tuple[NavigationState, jax.Array]:
+    """States and observations of vehicles at rest, leaves `[P, ...]` and `[P, O]`; numbers `[P]`
+    are of their routes."""
+    standing = Command(jnp.float32(0), jnp.float32(0))
+    action = starts.config.action(standing)
+
+    def settle(
+        dynamics: Params, terrain: TerrainMap, routes: Routes, task: Tasks, number: jax.Array
+    ) -> tuple[NavigationState, jax.Array]:
+        selected = terrain.select(task.world)
+        vehicle = tasks.place(selected, starts.config.chassis, task.start, task.yaw)
+        goal = jnp.append(task.goal, query.height(selected, task.goal))
+
+        def advance(
+            carry: tuple[VehicleState, History], _: None
+        ) -> tuple[tuple[VehicleState, History], None]:
+            vehicle, history = carry
+            return starts.dynamics.step(dynamics, selected, history, vehicle, standing), None
+
+        carry = vehicle, starts.dynamics.init(dynamics, selected, vehicle)
+        (vehicle, history), _ = jax.lax.scan(advance, carry, length=starts.config.settle_steps)
+        zero = jnp.int32(0)
+        state = NavigationState(
+            time=zero,
+            vehicle=vehicle,
+            history=history,
+            world=task.world,
+            goal=goal,
+            route=number,
+            action=action,
+            stalled=zero,
+            ending=zero,
+            variation=Variation.draw(starts.variation, jax.random.key(0), action),
+            belief=reveal.begin(starts.config.reveal, selected, vehicle.position, vehicle.rpy[2]),
+        )
+        believed = dataclasses.replace(selected, belief=state.belief)
+        return state, see(starts.config, believed, routes.select(number), state)
+
+    each = devices.spread(settle, (None, None, None, 0, 0))
+    return each(dynamics, terrain, routes, pool, numbers)
