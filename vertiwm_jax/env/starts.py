@@ -45,7 +45,7 @@ class Starts:
         else:
             routes = route.plan(config.route, terrain, config.chassis, pool.world, pool.goal)
         together, numbered = _in_turns(pool)
-        settle = devices.shared_out(partial(_settle, self), together)
+        settle = devices.shared_out(partial(_settle_once, self), together)
         states, seen = devices.in_turns(
             lambda some: settle(weights, terrain, routes, *some), numbered, together
         )
@@ -104,7 +104,7 @@ def _in_turns(pool: Tasks) -> tuple[int, tuple[Tasks, jax.Array]]:
     return together, (pool, jnp.arange(len(pool.world)))
 
 
-@partial(jax.jit, static_argnames="starts", compiler_options=devices.BRIEF)
+@partial(jax.jit, static_argnames="starts")
 def _settle(
     starts: Starts,
     dynamics: Params,
@@ -152,3 +152,7 @@ def _settle(
 
     each = devices.spread(settle, (None, None, None, 0, 0))
     return each(dynamics, terrain, routes, pool, numbers)
+
+
+# Apart, for what is traced inside of something else, as for its shapes, has no compiler options.
+_settle_once = jax.jit(_settle, static_argnames="starts", compiler_options=devices.BRIEF)
