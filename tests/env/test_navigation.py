@@ -188,6 +188,15 @@ def test_starts_stand_on_the_ground_and_resets_draw_all_of_them():
     assert len(np.unique(observation, axis=0)) == 8
 
 
+def test_shapes_are_those_of_what_is_made():
+    terrain = ground(hills())
+    pool = circle_tasks(terrain, 55.0, 3)
+    env, made = bicycle_env(terrain, pool)
+    shapes = env.shapes(BICYCLE, terrain, pool)
+    chex.assert_trees_all_equal_shapes_and_dtypes(shapes, made)
+    assert isinstance(shapes.start_observation, jax.ShapeDtypeStruct)
+
+
 def test_step_compiles_once_and_resets_by_itself():
     terrain = terrain_map.stack([ground(hills()), ground(hills(height=0.5))])
     config = NavigationConfig(horizon_seconds=0.5)
