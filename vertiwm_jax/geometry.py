@@ -3,14 +3,21 @@
 Rotations and poses are `jaxlie` groups. Tangent vectors are ordered translation first,
 rotation second, as in the paper's Log (Eq. 3). Roll, pitch and yaw are
 R = Rz(yaw) Ry(pitch) Rx(roll): positive pitch is nose down.
+
+What every step of a model needs is written out by components (see `vector`): jaxlie's own products
+gather them from arrays, which takes a CPU several times as long, and XLA as long to compile.
 """
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 
+from vertiwm_jax.vector import Axes, Vector
+
 _LARGEST_SINE = 1 - 2**-24
 """The largest float32 below one, where the slope of the inverse sine is still finite."""
+_SMALL = 1e-2
+"""Square of an angle, rad^2, below which series of three terms are exact."""
 
 
 def wrap(angle: jax.Array) -> jax.Array:
@@ -20,7 +27,11 @@ def wrap(angle: jax.Array) -> jax.Array:
 
 def rotation_from_rpy(rpy: jax.Array) -> jaxlie.SO3:
     """`[..., 3]` roll, pitch, yaw in rad to the rotation from body to world."""
-    return jaxlie.SO3.from_rpy_radians(rpy[..., 0], rpy[..., 1], rpy[..., 2])
+    cx, cy, cz = Vector.of(jnp.cos(0.5 * rpy))
+    sx, sy, sz = Vector.of(jnp.sin(0.5 * rpy))
+    w, x = cx * cy * cz + sx * sy * sz, sx * cy * cz - cx * sy * sz
+    y, z = cx * sy * cz + sx * cy * sz, cx * cy * sz - sx * sy * cz
+    return jaxlie.SO3(jnp.stack([w, x, y, z], axis=-1))
 
 
 def rpy_from_rotation(rotation: jaxlie.SO3) -> jax.Array:
@@ -39,6 +50,21 @@ def pose_from_rpy(position: jax.Array, rpy: jax.Array) -> jaxlie.SE3:
     return jaxlie.SE3.from_rotation_and_translation(rotation_from_rpy(rpy), position)
 
 
+def compose(first: jaxlie.SO3, second: jaxlie.SO3) -> jaxlie.SO3:
+    """The rotation first @ second, of unit length again."""
+    w, *v = jnp.moveaxis(first.wxyz, -1, 0)
+    u, *t = jnp.moveaxis(second.wxyz, -1, 0)
+    a, b = Vector(*v), Vector(*t)
+    real, imaginary = w * u - a.dot(b), a.times(u).plus(b, w).plus(a.cross(b))
+    scale = jax.lax.rsqrt(real**2 + imaginary.dot(imaginary))
+    return jaxlie.SO3(scale[..., None] * jnp.stack([real, *imaginary], axis=-1))
+
+
+def rotate(rotation: jaxlie.SO3, v: jax.Array) -> jax.Array:
+    """Vectors `[..., 3]` turned by a rotation."""
+    return Axes.from_quaternion(rotation.wxyz).to_world(Vector.of(v)).stacked()
+
+
 def exp(xi: jax.Array) -> jaxlie.SE3:
     """`[..., 6]` tangent (translation m, rotation rad) to a pose, exact to float32 rounding.
 
@@ -47,21 +73,61 @@ def exp(xi: jax.Array) -> jaxlie.SE3:
     v + a (w x v) + b (w x (w x v)) with a = (1 - cos t)/t^2, b = (t - sin t)/t^3 and their
     series near zero, so values and derivatives are exact at any angle.
     """
-    v, omega = xi[..., :3], xi[..., 3:]
-    square = jnp.sum(omega * omega, axis=-1, keepdims=True)
-    small = square < 1e-2
-    # Both branches of a `where` are differentiated: keep the unused one finite.
-    safe = jnp.where(small, 1.0, square)
-    angle = jnp.sqrt(safe)
-    a = jnp.where(small, 1 / 2 - square / 24 + square**2 / 720, (1 - jnp.cos(angle)) / safe)
+    v, omega = Vector.of(xi[..., :3]), Vector.of(xi[..., 3:])
+    square, cos, sinc = _half(omega)
+    small = square < _SMALL
+    a = 2 * sinc**2
     b = jnp.where(
-        small, 1 / 6 - square / 120 + square**2 / 5040, (angle - jnp.sin(angle)) / (safe * angle)
+        small,
+        1 / 6 - square / 120 + square**2 / 5040,
+        (1 - 2 * sinc * cos) / jnp.where(small, 1.0, square),
     )
-    once = jnp.cross(omega, v)
-    translation = v + a * once + b * jnp.cross(omega, once)
-    return jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.exp(omega), translation)
+    once = omega.cross(v)
+    translation = v.plus(once, a).plus(omega.cross(once), b).stacked()
+    rotation = rotation_from_vector(xi[..., 3:])
+    return jaxlie.SE3.from_rotation_and_translation(rotation, translation)
+
+
+def rotation_from_vector(omega: jax.Array) -> jaxlie.SO3:
+    """`[..., 3]` axis times angle in rad to a rotation."""
+    axis = Vector.of(omega)
+    _, cos, sinc = _half(axis)
+    return jaxlie.SO3(jnp.stack([cos, *axis.times(sinc)], axis=-1))
+
+
+def _half(omega: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """t^2 of an angle t, and of its half the cosine and the sine over t."""
+    square = omega.dot(omega)
+    small = square < _SMALL
+    # Both branches of a `where` are differentiated: keep the unused one finite.
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    cos = jnp.where(small, 1 - square / 8 + square**2 / 384, jnp.cos(angle / 2))
+    sinc = jnp.where(small, 1 / 2 - square / 48 + square**2 / 3840, jnp.sin(angle / 2) / angle)
+    return square, cos, sinc
 
 
 def log(pose: jaxlie.SE3) -> jax.Array:
-    """A pose to its `[..., 6]` tangent (translation m, rotation rad)."""
-    return pose.log()
+    """A pose to its `[..., 6]` tangent (translation m, rotation rad): the inverse of `exp`.
+
+    The translation is v - w x v / 2 + c (w x (w x v)) with c = (1 - (t/2) cot(t/2))/t^2.
+    """
+    real, *imaginary = jnp.moveaxis(pose.rotation().wxyz, -1, 0)
+    axis, translation = Vector(*imaginary), Vector.of(pose.translation())
+    square = axis.dot(axis)
+    small = square < _SMALL / 4  # sin^2 of half the angle
+    sin = jnp.sqrt(jnp.where(small, 1.0, square))
+    # Of both quaternions of a rotation, the one that turns by less than half a turn.
+    sign, cos = jnp.where(real < 0, -1.0, 1.0), jnp.abs(real)
+    tan2 = square / jnp.where(small, real, 1.0) ** 2
+    half = jnp.where(small, 1.0, jnp.arctan2(sin, cos))
+    series = (1 - tan2 / 3 + tan2**2 / 5) / jnp.where(small, cos, 1.0)
+    omega = axis.times(2 * sign * jnp.where(small, series, half / sin))
+    turn = omega.dot(omega)
+    c = jnp.where(
+        small,
+        1 / 12 + turn / 720 + turn**2 / 30240,
+        (1 - half * cos / sin) / jnp.where(small, 1.0, turn),
+    )
+    once = omega.cross(translation)
+    v = translation.plus(once, -0.5).plus(omega.cross(once), c)
+    return jnp.stack([*v, *omega], axis=-1)

@@ -7,13 +7,14 @@ from scipy.spatial.transform import Rotation
 
 from vertiwm_jax.mechanics.newton_euler import (
     ContactForce,
+    Push,
     Twist,
     _solve_spd,
     advance_twist,
     turned,
     velocity_at,
 )
-from vertiwm_jax.mechanics.vector import Axes, Vector
+from vertiwm_jax.vector import Axes, Vector
 
 MASS, INERTIA = 2500.0, np.array([1400.0, 4100.0, 5000.0])
 
@@ -58,7 +59,9 @@ def test_step_solves_the_dense_system(seed):
         arm, push = rng.normal(size=(count, 3)), 5000 * rng.normal(size=count)
         damping = stiff * rng.random(count)
         contacts.append(
-            ContactForce(vector(direction), vector(arm), jnp.asarray(push), jnp.asarray(damping))
+            ContactForce.of(
+                vector(arm), Push(vector(direction), jnp.asarray(push), jnp.asarray(damping))
+            )
         )
         jacobian = np.concatenate([direction, np.cross(arm, direction)], axis=1)
         matrix += seconds * jacobian.T @ (damping[:, None] * jacobian)
@@ -103,7 +106,7 @@ def test_a_stiff_damper_stops_its_point_at_any_step_without_overshoot():
     down = vector(np.array([[0.0, 0.0, -1.0]]))
     arm = vector(np.array([[0.3, -0.2, -0.5]]))
     twist = Twist(vector(np.array([0.0, 0.0, -3.0])), vector(np.zeros(3)))
-    damper = ContactForce(down, arm, -1e9 * jnp.ones(1) * 3.0, 1e9 * jnp.ones(1))
+    damper = ContactForce.of(arm, Push(down, -1e9 * jnp.ones(1) * 3.0, 1e9 * jnp.ones(1)))
     no_gravity = vector(np.zeros(3))
     for seconds in (0.001, 0.1):
         after = advance_twist(

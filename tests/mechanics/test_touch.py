@@ -8,11 +8,11 @@ import pytest
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.touch import LEAST_YIELD, Touch, touch
-from vertiwm_jax.mechanics.vector import Axes, Vector
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.vector import Axes, Vector
 
 CONCRETE, MUD, SNOW = 1, 7, 9
 VEHICLE = hmmwv()

@@ -1,11 +1,11 @@
 """Newton-Euler equations of one rigid body under stiff contacts, solved linearly implicitly."""
 
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax.mechanics.vector import Axes, Vector
+from vertiwm_jax.vector import Axes, Vector, sum_of
 
 
 class Twist(NamedTuple):
@@ -15,19 +15,39 @@ class Twist(NamedTuple):
     angular: Vector
 
 
-class ContactForce(NamedTuple):
-    """Forces `[C]` along given directions at given points, and how they answer to motion.
+class Push(NamedTuple):
+    """Forces `[C]` along unit vectors, and how they answer to motion.
 
-    direction: unit vectors, body components `[C]`.
-    arm: points of application relative to the centre of mass, m, body components `[C]`.
-    force: N, at the current velocity.
+    direction: body components. force: N, at the current velocity.
     damping: N s/m, >= 0: force lost per velocity gained along the direction.
     """
 
     direction: Vector
-    arm: Vector
     force: jax.Array
     damping: jax.Array
+
+
+class ContactForce(NamedTuple):
+    """All that acts on points `[C]` of the body, in its components.
+
+    arm: of the points from the centre of mass, m. force: N, at the current velocity.
+    damping: N s/m, rows of a symmetric matrix: force lost per velocity gained.
+    """
+
+    arm: Vector
+    force: Vector
+    damping: tuple[Vector, Vector, Vector]
+
+    @classmethod
+    def of(cls, arm: Vector, *pushes: Push) -> Self:
+        """Several pushes on the same points."""
+        force = sum_of(push.direction.times(push.force) for push in pushes)
+        weighted = [push.direction.times(push.damping) for push in pushes]
+        x, y, z = (
+            sum_of(w.times(push.direction[i]) for w, push in zip(weighted, pushes, strict=True))
+            for i in range(3)
+        )
+        return cls(arm, force, (x, y, z))
 
 
 def velocity_at(twist: Twist, arm: Vector) -> Vector:
@@ -45,7 +65,7 @@ def advance_twist(
 ) -> Twist:
     """The body's twist after one linearly implicit Euler step, in the axes it had before.
 
-    (M + dt sum_c D_c J_c^T J_c) dv = dt (f + sum_c F_c J_c^T), with J_c = [d, r x d]: the damping
+    (M + dt sum_c J_c^T D_c J_c) dv = dt (f + sum_c J_c^T F_c), with J_c = [1, -r x]: the damping
     of every contact acts on the new velocity, so stiff springs and sticking friction are stable
     at any step (Hairer and Wanner, Solving Ordinary Differential Equations II, sec. IV.7).
 
@@ -56,12 +76,18 @@ def advance_twist(
     rhs = [*gravity.times(mass), zero, zero, zero]
     matrix = [[diagonal[i] if i == j else zero for j in range(i + 1)] for i in range(6)]
     for contact in contacts:
-        jacobian = (*contact.direction, *contact.arm.cross(contact.direction))
+        push = (*contact.force, *contact.arm.cross(contact.force))
+        # D, D (-r x) by rows, and (r x) of that by columns: all of the lower triangle.
+        mixed = [contact.arm.cross(row) for row in contact.damping]
+        angular = [contact.arm.cross(Vector(*column)) for column in zip(*mixed, strict=True)]
         for i in range(6):
-            rhs[i] = rhs[i] + jnp.sum(contact.force * jacobian[i], axis=-1)
-            weighted = seconds * contact.damping * jacobian[i]
+            rhs[i] = rhs[i] + jnp.sum(push[i], axis=-1)
             for j in range(i + 1):
-                matrix[i][j] = matrix[i][j] + jnp.sum(weighted * jacobian[j], axis=-1)
+                if i < 3:
+                    damping = contact.damping[j][i]
+                else:
+                    damping = mixed[j][i - 3] if j < 3 else angular[j - 3][i - 3]
+                matrix[i][j] = matrix[i][j] + seconds * jnp.sum(damping, axis=-1)
     change = _solve_spd(matrix, [seconds * r for r in rhs])
     linear, angular = Vector(*change[:3]), Vector(*change[3:])
     return Twist(twist.linear.plus(linear), twist.angular.plus(angular))
@@ -70,8 +96,8 @@ def advance_twist(
 def applied(contact: ContactForce, before: Twist, after: Twist) -> Vector:
     """Forces `[C]` that took the twist from `before` to `after`, N, in the axes it had before."""
     gained = velocity_at(after, contact.arm).plus(velocity_at(before, contact.arm), -1.0)
-    lost = contact.damping * gained.dot(contact.direction)
-    return contact.direction.times(contact.force - lost)
+    lost = Vector(*(row.dot(gained) for row in contact.damping))
+    return contact.force.plus(lost, -1.0)
 
 
 def turned(twist: Twist, inertia: Vector, turn: Axes) -> Twist:

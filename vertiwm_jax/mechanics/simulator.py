@@ -17,6 +17,7 @@ from flax import struct
 from vertiwm_jax import geometry
 from vertiwm_jax.mechanics.newton_euler import (
     ContactForce,
+    Push,
     Twist,
     advance_twist,
     applied,
@@ -25,12 +26,12 @@ from vertiwm_jax.mechanics.newton_euler import (
 )
 from vertiwm_jax.mechanics.scm import ScmContact, soil_forces
 from vertiwm_jax.mechanics.touch import Touch, touch
-from vertiwm_jax.mechanics.vector import Axes, Vector
 from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle
 from vertiwm_jax.mechanics.wheel import Contact, Wheel, WheelForces, rigid_forces
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
+from vertiwm_jax.vector import Axes, Vector
 
 ADHESION_SPEED = 0.1
 """Slip speed, m/s, at which friction has reached 70 % of its limit."""
@@ -235,15 +236,21 @@ def _substep(
     traction = ground.longitudinal + radius * grip * spin_up
     traction_rate = grip * (1 - seconds * radius**2 * grip / inertia)
 
-    contacts = [
-        ContactForce(n, arm, load, seconds * rate),
-        ContactForce(rolling, arm, traction, traction_rate),
-        ContactForce(lateral, arm, ground.lateral, grip),
-        *_hull_contact(vehicle, body.twist, hull, centre, seconds),
-    ]
+    on_wheels = ContactForce.of(
+        arm,
+        Push(n, load, seconds * rate),
+        Push(rolling, traction, traction_rate),
+        Push(lateral, ground.lateral, grip),
+    )
+    on_hull = _hull_contact(vehicle, body.twist, hull, centre, seconds)
     gravity = Vector(axes.x.z, axes.y.z, axes.z.z).times(-GRAVITY)
     twist = advance_twist(
-        body.twist, vehicle.mass, Vector.of(vehicle.inertia), gravity, contacts, seconds
+        body.twist,
+        vehicle.mass,
+        Vector.of(vehicle.inertia),
+        gravity,
+        [on_wheels, on_hull],
+        seconds,
     )
 
     gained = velocity_at(twist, arm).plus(velocity, -1.0)
@@ -265,8 +272,9 @@ def _substep(
         wheels=wheels,
         force=jnp.stack([load, traction, ground.lateral], axis=-1),
     )
-    forces = [axes.to_world(applied(contact, body.twist, twist)).stacked() for contact in contacts]
-    on_ground = GroundForces(sum(forces[1:3], forces[0]), sum(forces[4:], forces[3])[0])
+    forces = (applied(contact, body.twist, twist) for contact in (on_wheels, on_hull))
+    of_wheels, of_hull = (axes.to_world(force).stacked() for force in forces)
+    on_ground = GroundForces(of_wheels, of_hull[0])
     return _advance_pose(vehicle, body, axes, centre, twist, seconds), history, on_ground
 
 
@@ -382,7 +390,7 @@ def _tangents(normal: Vector, cos: jax.Array, sin: jax.Array) -> tuple[Vector, V
 
 def _hull_contact(
     vehicle: Vehicle, twist: Twist, hull: Touch, centre: Vector, seconds: float
-) -> list[ContactForce]:
+) -> ContactForce:
     """The chassis on the ground: a heavily damped spring, and friction.
 
     Soil gives way under the belly, as Chrono's SCM feels wheels only, but not under a roof.
@@ -399,19 +407,20 @@ def _hull_contact(
     load, rate = jnp.where(pressing, load, 0.0), jnp.where(pressing, rate, 0.0)
     ahead, drift = velocity.dot(forward), velocity.dot(left)
     grip = HULL_FRICTION * load * jax.lax.rsqrt(ahead**2 + drift**2 + ADHESION_SPEED**2)
-    return [
-        ContactForce(n, arm, load, rate),
-        ContactForce(forward, arm, -grip * ahead, grip),
-        ContactForce(left, arm, -grip * drift, grip),
-    ]
+    return ContactForce.of(
+        arm,
+        Push(n, load, rate),
+        Push(forward, -grip * ahead, grip),
+        Push(left, -grip * drift, grip),
+    )
 
 
 def _advance_pose(
     vehicle: Vehicle, body: _Body, axes: Axes, centre: Vector, twist: Twist, seconds: float
 ) -> _Body:
     """Moves the centre of mass by the new velocity and turns the body about it."""
-    turn = jaxlie.SO3.exp(seconds * twist.angular.stacked())
-    quaternion = (jaxlie.SO3(body.quaternion) @ turn).normalize().wxyz
+    turn = geometry.rotation_from_vector(seconds * twist.angular.stacked())
+    quaternion = geometry.compose(jaxlie.SO3(body.quaternion), turn).wxyz
     at_centre = body.position.plus(axes.to_world(centre.plus(twist.linear, seconds)))
     position = at_centre.plus(Axes.from_quaternion(quaternion).to_world(centre), -1.0)
     inertia = Vector.of(vehicle.inertia)

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.mechanics.vector import Axes, Vector
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
+from vertiwm_jax.vector import Axes, Vector
 
 TREAD_ANGLES = (-0.7, -0.35, 0.0, 0.35, 0.7)
 """Where both rims of a wheel are tested against the ground, rad from straight down."""

@@ -18,8 +18,8 @@ def increment(before: VehicleState, after: VehicleState) -> jax.Array:
     """
     rotation = geometry.rotation_from_rpy(before.rpy).inverse()
     relative = jaxlie.SE3.from_rotation_and_translation(
-        rotation @ geometry.rotation_from_rpy(after.rpy),
-        rotation @ (after.position - before.position),
+        geometry.compose(rotation, geometry.rotation_from_rpy(after.rpy)),
+        geometry.rotate(rotation, after.position - before.position),
     )
     return geometry.log(relative)
 
@@ -51,11 +51,11 @@ def twist(state: VehicleState) -> jax.Array:
 
 def moved(state: VehicleState, increment: jax.Array, twist: jax.Array) -> VehicleState:
     """The state T Exp(xi) with nu: increment `[..., 6]` m and rad, twist `[..., 6]`."""
-    pose = state.pose @ geometry.exp(increment)
+    before, relative = geometry.rotation_from_rpy(state.rpy), geometry.exp(increment)
     return replace(
         state,
-        position=pose.translation(),
-        rpy=geometry.rpy_from_rotation(pose.rotation()),
+        position=state.position + geometry.rotate(before, relative.translation()),
+        rpy=geometry.rpy_from_rotation(geometry.compose(before, relative.rotation())),
         velocity=twist[..., :3],
         angular_velocity=twist[..., 3:],
     )

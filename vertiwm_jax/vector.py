@@ -5,6 +5,8 @@ numbers at a time. With one array per component, every operation runs over all w
 vehicles at once. Components may have any equal shapes `[...]`.
 """
 
+import functools
+from collections.abc import Iterable
 from typing import NamedTuple, Self
 
 import jax
@@ -49,6 +51,12 @@ class Vector(NamedTuple):
         return self.times(jax.lax.rsqrt(self.dot(self)))
 
 
+def sum_of(vectors: Iterable[Vector]) -> Vector:
+    """The sum of one or more."""
+    first, *others = vectors
+    return functools.reduce(Vector.plus, others, first)
+
+
 class Axes(NamedTuple):
     """A rotation from body to world, as the body's axes in world coordinates."""
 
@@ -58,8 +66,8 @@ class Axes(NamedTuple):
 
     @classmethod
     def from_quaternion(cls, quaternion: jax.Array) -> Self:
-        """Unit quaternion `[4]` (w, x, y, z) to the body's axes."""
-        w, x, y, z = quaternion
+        """Unit quaternion `[..., 4]` (w, x, y, z) to the body's axes."""
+        w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
         return cls(
             Vector(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
             Vector(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
