@@ -15,7 +15,7 @@ from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.worlds import WorldConfig
-from vertiwm_jax.world_model.choice import ModelName, choose
+from vertiwm_jax.world_model.choice import ModelName, choose, lean
 
 BATCHES = (1, 20, 256, 1024)
 STEPS = 20
@@ -44,6 +44,7 @@ def drives(batch: int, steps: int) -> tuple[TerrainMap, VehicleState, Command]:
 def rates(name: ModelName, weights: Path | None, batches: Sequence[int]) -> dict[str, Figures]:
     """Steps a second of one model, by batch."""
     model, params = choose(name, weights)
+    model = lean(model)
 
     def drive(params: Params, start: VehicleState, commands: Command) -> jax.Array:
         history = model.init(params, terrain, start)

@@ -20,6 +20,7 @@ from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.worlds import WorldConfig
+from vertiwm_jax.world_model.choice import lean
 from vertiwm_jax.world_model.model import VertiWM, VertiWMParams
 
 BATCHES = (20, 256)
@@ -144,7 +145,7 @@ def rates(ways: Sequence[Way], batch: int, repeats: int) -> dict[str, Figures]:
     """Steps a second at one batch, once they are known to be the same steps."""
     drives = Drives.draw(batch, STEPS)
     model, params = VertiWM.pretrained()
-    roll_ours = ours(model, params)
+    roll_ours = ours(lean(model), params)
     rolls: dict[str, Roll] = {_OURS: roll_ours(drives)}
     for way in ways:
         peer = TorchVertiWM(model, params)

@@ -6,7 +6,7 @@ in place and time and again, for new memory comes several times slower.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from benchmarks._harness import Figures, measure, parser, report
 from benchmarks.models import drives
 from vertiwm_jax.world_model import fusion
+from vertiwm_jax.world_model.choice import choose, lean
 from vertiwm_jax.world_model.fusion import Proposal
 from vertiwm_jax.world_model.model import VertiWM
 
@@ -30,8 +31,9 @@ def over_vehicles(part: Part) -> Callable[..., Any]:
 
 def parts(batch: int) -> dict[str, Part]:
     """Every part of a step on `batch` vehicles after their first step, and the whole."""
-    model, params = VertiWM.pretrained()
-    transformer, nesam, encoders = model.transformer, model.nesam, params.transformer.encoders
+    model, params = choose("vertiwm")
+    model = cast(VertiWM, lean(model))
+    transformer, nesam = model.transformer, model.nesam
     terrain, states, commands = drives(batch, 1)
     command = jax.tree.map(lambda x: x[:, 0], commands)
 
@@ -67,7 +69,7 @@ def parts(batch: int) -> dict[str, Part]:
     driven = (state, command)
     return {
         "map query and encoders": (
-            lambda t, state: transformer.exteroception.look((encoders,), t, state),
+            lambda t, state: transformer.look(params.transformer, t, state),
             (terrain, state),
         ),
         "Transformer": (

@@ -61,13 +61,13 @@ def embedding(history: History) -> jax.Array:
 
     `ValueError` for a model that sees none.
     """
-    perception = getattr(history, "perception", None)
-    if perception is None:
+    latent = getattr(getattr(history, "perception", None), "latent", None)
+    if latent is None:
         raise ValueError(
-            "embeddings: expected a model that sees patches of the ground, found one that does "
-            "not; world_model.perception.Sighted gives it encoders"
+            "embeddings: expected a model that sees patches of the ground and remembers them, "
+            "found one that does not; world_model.perception.Sighted gives it encoders"
         )
-    return perception.latent
+    return latent
 
 
 def warm_up(

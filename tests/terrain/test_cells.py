@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from vertiwm_jax.networks.encoder import in_rows
 from vertiwm_jax.terrain import cells, crop
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.crop import PatchConfig
@@ -36,7 +37,8 @@ def kernels(outputs: int = 5):
 
 @partial(jax.jit, static_argnames="config")
 def projected(terrain, position, yaw, of_both, config=RELATIVE):
-    return cells.projections(terrain, position, yaw, config, *of_both)
+    found = cells.projections(terrain, position, yaw, config, *of_both)
+    return tuple(in_rows(x) for x in found)
 
 
 @partial(jax.jit, static_argnames="config")
@@ -86,7 +88,7 @@ def test_batches_are_those_of_one_at_a_time(vehicles, classes):
     which = jnp.arange(number) % 3
 
     def one(which, position, yaw):
-        return cells.projections(terrain.select(which), position, yaw, RELATIVE, *kernels())
+        return projected(terrain.select(which), position, yaw, kernels())
 
     many = one
     for _ in vehicles:

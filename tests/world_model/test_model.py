@@ -52,13 +52,15 @@ class SeeingBicycle:
     bicycle: KinematicBicycle = KinematicBicycle()
 
     def init(self, params, terrain, state):
-        (perception,) = self.exteroception.look((params.encoders,), terrain, state)
+        perception = self.look(params, terrain, state)
         return SeeingHistory(self.bicycle.init(params.physics, terrain, state), perception)
 
     def step(self, params, terrain, history, state, command):
         state, history = self.propose(params, terrain, history, state, command)
-        (perception,) = self.exteroception.look((params.encoders,), terrain, state)
-        return state, replace(history, perception=perception)
+        return state, replace(history, perception=self.look(params, terrain, state))
+
+    def look(self, params, terrain, state):
+        return self.exteroception.look((params.encoders,), terrain, state)[0]
 
     def propose(self, params, terrain, history, state, command):
         arguments = (params.physics, terrain, history.physics, state, command)

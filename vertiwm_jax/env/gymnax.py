@@ -17,7 +17,7 @@ from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.tasks import random_tasks
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.worlds import WorldConfig
-from vertiwm_jax.world_model.choice import ModelName, choose
+from vertiwm_jax.world_model.choice import ModelName, choose, lean
 
 NAME = "OffRoadNavigation-v0"
 
@@ -44,7 +44,10 @@ class ProceduralNavigation(NavigationEnv):
         **settings,
     ) -> Self:
         """The environment in a model of `world_model.choice`, with any of the other settings."""
-        return cls(choose(model)[0], config, model=model, **settings)
+        dynamics = choose(model)[0]
+        if not config.embeddings:
+            dynamics = lean(dynamics)
+        return cls(dynamics, config, model=model, **settings)
 
     @property
     def default_params(self) -> NavigationParams:

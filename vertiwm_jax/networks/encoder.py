@@ -36,13 +36,15 @@ class TerrainEncoder(nn.Module):
     def __call__(self, patch: jax.Array) -> jax.Array:
         """`[..., 128, 128, channels]` in about [-1, 1] to `[..., 16, 16, 18]`."""
         assert patch.shape[-1] == self.channels, patch.shape
-        return self.of_cells(_cells(patch) @ self.cell_kernel.reshape(-1, LATENT_CHANNELS))
+        projected = _cells(patch) @ self.cell_kernel.reshape(-1, LATENT_CHANNELS)
+        fours = _space_to_depth(projected, 2)
+        return in_rows(self.of_fours(fours.reshape(*fours.shape[:-1], 4, LATENT_CHANNELS)))
 
-    def of_cells(self, projected: jax.Array) -> jax.Array:
-        """The same of what `cell_kernel` makes of each cell, `[..., 16, 16, 18]`."""
-        fours = _space_to_depth(projected, 2) + jnp.tile(self.cell_bias, 4)
+    def of_fours(self, projected: jax.Array) -> jax.Array:
+        """The same of what `cell_kernel` makes of each cell, four by four: `[..., 8, 8, 4, 18]`."""
+        fours = projected.reshape(*projected.shape[:-2], -1) + jnp.tile(self.cell_bias, 4)
         coarse = nn.silu(self.Conv_1(nn.silu(self.Conv_0(fours))))
-        return _depth_to_space(fours + self.expand(coarse), 2)
+        return (fours + self.expand(coarse)).reshape(projected.shape)
 
 
 class _Halving(nn.Module):
@@ -144,6 +146,11 @@ def _cells(patch: jax.Array) -> jax.Array:
     first = len(batch)
     order = *range(first), *(first + i for i in (0, 2, 4, 1, 3))
     return cells.transpose(order).reshape(*batch, h, w, -1)
+
+
+def in_rows(fours: jax.Array) -> jax.Array:
+    """`[..., h, w, 4, c]`, row by row of each 2 x 2 cells, to `[..., 2 h, 2 w, c]`."""
+    return _depth_to_space(fours.reshape(*fours.shape[:-2], -1), 2)
 
 
 def _depth_to_space(x: jax.Array, block: int) -> jax.Array:

@@ -20,7 +20,7 @@ from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
 from vertiwm_jax.rl import ground
 from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.choice import Imagined, ModelName, choose, sighted
+from vertiwm_jax.world_model.choice import Imagined, ModelName, choose, lean, sighted
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,9 @@ def dynamics(config: TaskConfig, model: Imagined) -> tuple[Dynamics, Params]:
         chosen = config.simulator, chrono_like(config.driven.vehicle)
     else:
         chosen = choose(model, config.weights, vehicle=config.driven.vehicle)
-    return sighted(model, *chosen, config.weights) if config.navigation.embeddings else chosen
+    if config.navigation.embeddings:
+        return sighted(model, *chosen, config.weights)
+    return lean(chosen[0]), chosen[1]
 
 
 def outcomes(info: dict[str, jax.Array]) -> dict[str, jax.Array]:

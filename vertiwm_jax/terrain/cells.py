@@ -24,6 +24,8 @@ _DIFFERENCES = np.array([[1, 0, 0], [-1, 1, 0], [1, -2, 1]])
 _HINGES = np.kron(_DIFFERENCES, _DIFFERENCES).T.astype(np.float32)
 _BYTES = np.array([0, 8, 16])  # of red, green and blue in a colour
 _DRAWN_TOGETHER = 128  # cells with borders
+_SIDE = crop.PATCH_PIXELS // CELL_PIXELS // 2
+_FOURS = crop.CELLS_OF_PATCH.reshape(2, _SIDE, 2, _SIDE, 2).swapaxes(2, 3).reshape(2, -1)
 
 
 @partial(jax.jit, static_argnames="config", inline=True)
@@ -35,14 +37,15 @@ def projections(
     of_elevation: jax.Array,
     of_colours: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Linear maps `[64, F]` and `[3, 64, F]` of every cell's pixels: `[16, 16, F]` of each.
+    """Linear maps `[64, F]` and `[3, 64, F]` of every cell's pixels: `[8, 8, 4, F]` of each.
 
     To rounding what they make of `crop.patches`, which has the other arguments. No gradient flows.
+    Cells come four by four, row by row of each 2 x 2, as encoders go on with them.
     """
     of_elevation, of_colours = jax.lax.stop_gradient((of_elevation, of_colours))
     position, yaw = jax.lax.stop_gradient((position, yaw))
     level, relief = crop.scale(terrain, position, config)
-    middles, around = crop.places(terrain, position, yaw)
+    middles, around = crop.places(terrain, position, yaw, _FOURS)
 
     def of_pixels() -> tuple[jax.Array, jax.Array]:
         elevation, rgb = crop.pixels(terrain, middles, around, level, relief, config)
@@ -69,8 +72,7 @@ def projections(
         )
     else:
         found = of_pixels()
-    side = crop.PATCH_PIXELS // CELL_PIXELS
-    elevation, colours = (x.reshape(side, side, -1) for x in found)
+    elevation, colours = (x.reshape(_SIDE, _SIDE, 4, -1) for x in found)
     return elevation, colours
 
 

@@ -31,7 +31,8 @@ def _square(number: int, metres: float) -> np.ndarray:
     return np.stack(np.meshgrid(offset, offset, indexing="ij")).reshape(2, -1).astype(np.float32)
 
 
-_CELLS_OF_PATCH = _square(_CELLS, CELL_PIXELS * PIXEL_METRES)
+CELLS_OF_PATCH = _square(_CELLS, CELL_PIXELS * PIXEL_METRES)
+"""`[2, 256]` m from the vehicle to the middles of cells, row by row."""
 _PIXELS_OF_CELL = _square(CELL_PIXELS, PIXEL_METRES)
 
 
@@ -78,17 +79,19 @@ def scale(
     return position[2], RELIEF_METRES
 
 
-def places(terrain: TerrainMap, position: jax.Array, yaw: jax.Array) -> tuple[jax.Array, jax.Array]:
+def places(
+    terrain: TerrainMap, position: jax.Array, yaw: jax.Array, cells: np.ndarray = CELLS_OF_PATCH
+) -> tuple[jax.Array, jax.Array]:
     """Fractional columns and rows of the map.
 
-    `[2, 256]` of the middles of a patch's cells, and from there `[2, 64]` to the pixels of each.
+    `[2, N]` of the middles of a patch's cells, and from there `[2, 64]` to the pixels of each.
     """
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     x, y = position[0] - terrain.origin[0], terrain.origin[1] - position[1]
     turn = jnp.array([[cos, -sin], [-sin, -cos]]) / terrain.resolution
     origin = jnp.stack([x, y])[:, None] / terrain.resolution
     # Matmuls in full precision: anything else would be fused, sine and cosine for every pixel.
-    middles = jnp.dot(turn, _CELLS_OF_PATCH, precision="highest") + origin
+    middles = jnp.dot(turn, cells, precision="highest") + origin
     around = jnp.dot(turn, _PIXELS_OF_CELL, precision="highest")
     lost = jnp.isnan(middles[:, :1])
     return jnp.where(lost, 0.0, middles), jnp.where(lost, 0.0, around)

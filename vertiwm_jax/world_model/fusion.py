@@ -9,7 +9,7 @@ from flax import struct
 
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.world_model import motion
-from vertiwm_jax.world_model.perception import Perception
+from vertiwm_jax.world_model.perception import Glance, Perception
 
 GateTerrain = Literal["mean", "both"]
 """Whether the gate reads the mean of both specialists' terrain features, or all of them."""
@@ -32,10 +32,12 @@ class Proposal:
 
     increment: jax.Array
     twist: jax.Array
-    perception: Perception
+    perception: Perception | Glance
 
     @classmethod
-    def of(cls, state: VehicleState, proposed: VehicleState, perception: Perception) -> Self:
+    def of(
+        cls, state: VehicleState, proposed: VehicleState, perception: Perception | Glance
+    ) -> Self:
         """From the next state that a specialist gives (Eq. 4)."""
         return cls(motion.increment(state, proposed), motion.twist(proposed), perception)
 

@@ -188,6 +188,18 @@ class VertiWM:
     gate_terrain: GateTerrain = "mean"
     coefficients: Literal["grouped", "scalar"] = "grouped"
 
+    def __post_init__(self) -> None:
+        if getattr(self.transformer, "remembers", "latents") == "glance" and not self.can_be_lean:
+            raise ValueError(
+                "transformer.remembers: expected latents, which NeSAM looks at too unless it "
+                "shares encoders and has soils from the map, found glance"
+            )
+
+    @property
+    def can_be_lean(self) -> bool:
+        """Whether nothing but the Transformer's network reads latents."""
+        return self.encoders == "shared" and getattr(self.nesam, "soil", "map") == "map"
+
     def init_params(
         self, key: jax.Array, transformer: Params, nesam: Params, gates: int = 1
     ) -> VertiWMParams:
@@ -311,16 +323,15 @@ class VertiWM:
         state: VehicleState,
     ) -> VertiWMHistory:
         """The history with what both see at a state."""
-        encoders = params.transformer.encoders, params.nesam.encoders
-        both = self.transformer.exteroception, self.nesam.exteroception
-        if self.encoders == "shared":
-            (by_transformer,) = both[0].look(encoders[:1], terrain, state)
-            by_nesam = None
-        elif both[0] == both[1]:
-            by_transformer, by_nesam = both[0].look(encoders, terrain, state)
+        first, second = self.transformer.exteroception, self.nesam.exteroception
+        by_nesam = None
+        if self.encoders == "own" and first == second:
+            encoders = params.transformer.encoders, params.nesam.encoders
+            by_transformer, by_nesam = first.look(encoders, terrain, state)
         else:
-            (by_transformer,) = both[0].look(encoders[:1], terrain, state)
-            (by_nesam,) = both[1].look(encoders[1:], terrain, state)
+            by_transformer = self.transformer.look(params.transformer, terrain, state)
+            if self.encoders == "own":
+                by_nesam = self.nesam.look(params.nesam, terrain, state)
         return replace(
             history,
             transformer=replace(history.transformer, perception=by_transformer),

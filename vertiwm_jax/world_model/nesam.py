@@ -110,7 +110,7 @@ class Nesam:
         empty = self._network.apply(params.network, (2,), method=SpecialistNetwork.empty_cache)
         cache = cast(KeyValueCache, empty) if self.residual else None
         memory = self.simulator.init(params.simulator, terrain, state)
-        return NesamHistory(memory, cache, state, self._look(params, terrain, state))
+        return NesamHistory(memory, cache, state, self.look(params, terrain, state))
 
     def step(
         self,
@@ -122,7 +122,7 @@ class Nesam:
     ) -> tuple[VehicleState, NesamHistory]:
         """The next state, and a look at the ground there."""
         state, history = self.propose(params, terrain, history, state, command)
-        return state, replace(history, perception=self._look(params, terrain, state))
+        return state, replace(history, perception=self.look(params, terrain, state))
 
     def propose(
         self,
@@ -181,7 +181,7 @@ class Nesam:
         """
 
         def advance(memory: SimulatorHistory, inputs: tuple[VehicleState, Command]):
-            ground = self._ground(params, terrain, self._look(params, terrain, inputs[0]))
+            ground = self._ground(params, terrain, self.look(params, terrain, inputs[0]))
             proposed, memory = self.simulator.step(params.simulator, ground, memory, *inputs)
             return memory, (proposed, memory)
 
@@ -193,7 +193,8 @@ class Nesam:
     def _network(self) -> SpecialistNetwork:
         return SpecialistNetwork(self.size)
 
-    def _look(self, params: NesamParams, terrain: TerrainMap, state: VehicleState) -> Perception:
+    def look(self, params: NesamParams, terrain: TerrainMap, state: VehicleState) -> Perception:
+        """What it sees at a state."""
         return self.exteroception.look((params.encoders,), terrain, state)[0]
 
     def _ground(

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.dynamics import Dynamics, History, Params
-from vertiwm_jax.networks.encoder import TerrainEncoder
+from vertiwm_jax.networks.encoder import TerrainEncoder, in_rows
 from vertiwm_jax.state import Command, Patches, VehicleState
 from vertiwm_jax.terrain import cells, crop
 from vertiwm_jax.terrain.crop import PATCH_PIXELS, PatchConfig
@@ -18,7 +18,8 @@ from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.batching import few_at_a_time
 
 _ELEVATION, _SEMANTIC = TerrainEncoder(1), TerrainEncoder(3)
-_TOGETHER = 16  # vehicles, whose patches of 260 kB each stay near a core
+TOGETHER = 16
+"""Vehicles that look at a time, whose patches of 260 kB each stay near a core."""
 
 
 @struct.dataclass
@@ -41,6 +42,18 @@ class Perception:
         """`[..., 36]` the mean of every channel over space, e of Eq. 5."""
         means = (jnp.mean(x, axis=(-3, -2)) for x in (self.elevation, self.semantic))
         return jnp.concatenate([*means], axis=-1)
+
+
+@struct.dataclass
+class Glance:
+    """What a model goes on with of a `Perception`: a quarter of it, and no latents.
+
+    reduced: `[..., 256 C]` the C numbers that the Transformer's network makes of each cell.
+    averaged: `[..., 36]` as that of `Perception`.
+    """
+
+    reduced: jax.Array
+    averaged: jax.Array
 
 
 @struct.dataclass
@@ -87,7 +100,19 @@ class Exteroception:
     def _look(
         self, encoders: tuple[EncoderParams, ...], terrain: TerrainMap, state: VehicleState
     ) -> tuple[Perception, ...]:
-        """`encode` of `query`, to rounding, but most pixels need not be drawn."""
+        """`encode` of `query`, to rounding."""
+        return tuple(
+            Perception(in_rows(elevation), in_rows(semantic))
+            for elevation, semantic in self.see(encoders, terrain, state)
+        )
+
+    def see(
+        self, encoders: tuple[EncoderParams, ...], terrain: TerrainMap, state: VehicleState
+    ) -> tuple[tuple[jax.Array, jax.Array], ...]:
+        """Latents by each pair of encoders, of elevation and colours, four cells by four.
+
+        `[8, 8, 4, 18]`, in the order of `cells.projections`. Most pixels need not be drawn.
+        """
         of_elevation, of_semantic = (
             jnp.concatenate([params["params"]["cell_kernel"] for params in kind], axis=-1)
             for kind in ([p.elevation for p in encoders], [p.semantic for p in encoders])
@@ -97,9 +122,9 @@ class Exteroception:
         )
         of_each = zip(*(jnp.split(x, len(encoders), axis=-1) for x in projected), strict=True)
         return tuple(
-            Perception(
-                _of_cells(_ELEVATION, params.elevation, elevation),
-                _of_cells(_SEMANTIC, params.semantic, semantic),
+            (
+                _of_fours(_ELEVATION, params.elevation, elevation),
+                _of_fours(_SEMANTIC, params.semantic, semantic),
             )
             for params, (elevation, semantic) in zip(encoders, of_each, strict=True)
         )
@@ -117,13 +142,13 @@ class Exteroception:
         return Perception(cast(jax.Array, elevation), cast(jax.Array, semantic))
 
 
-def _of_cells(encoder: TerrainEncoder, params: Any, projected: jax.Array) -> jax.Array:
-    return cast(jax.Array, encoder.apply(params, projected, method=TerrainEncoder.of_cells))
+def _of_fours(encoder: TerrainEncoder, params: Any, projected: jax.Array) -> jax.Array:
+    return cast(jax.Array, encoder.apply(params, projected, method=TerrainEncoder.of_fours))
 
 
 @functools.cache  # one function for each, so that what was traced is found again
 def _few_looks(exteroception: Exteroception) -> Callable[..., tuple[Perception, ...]]:
-    return few_at_a_time(exteroception._look, _TOGETHER)
+    return few_at_a_time(exteroception._look, TOGETHER)
 
 
 @struct.dataclass
@@ -197,6 +222,10 @@ class Specialist(Dynamics, Protocol):
 
     @property
     def exteroception(self) -> Exteroception: ...
+
+    def look(self, params: Params, terrain: TerrainMap, state: VehicleState) -> Any:
+        """What `history.perception` is at a state."""
+        ...
 
     def propose(
         self,

@@ -6,13 +6,14 @@ import jax.numpy as jnp
 
 from vertiwm_jax.networks.encoder import LATENT_CHANNELS
 from vertiwm_jax.networks.transformer import KeyValueCache, Transformer
-from vertiwm_jax.world_model.perception import Perception
+from vertiwm_jax.world_model.perception import Glance, Perception
 from vertiwm_jax.world_model.sizes import TransformerSize
 
 WINDOW = 16
 """Tokens that a specialist remembers, of 0.1 s each."""
-Ground = Perception | jax.Array | None
-"""What a specialist is told of the ground: latents, an indicator `[..., 1]`, or nothing."""
+Ground = Perception | Glance | jax.Array | None
+"""What a specialist is told of the ground: latents, what `Reduction` made of them, an indicator
+`[..., 1]`, or nothing."""
 
 
 class SpecialistNetwork(nn.Module):
@@ -23,7 +24,7 @@ class SpecialistNetwork(nn.Module):
     def setup(self) -> None:
         size = self.size
         self.embed = nn.Dense(size.width)
-        self.reduce = _Reduction(size.channels)
+        self.reduce = Reduction(size.channels)
         self.embed_ground = nn.Dense(size.width, use_bias=False)
         self.transformer = Transformer(size.layers, size.width, size.heads, size.hidden, WINDOW)
         # Untrained, it changes nothing: the mean transition stays, or physics.
@@ -49,20 +50,23 @@ class SpecialistNetwork(nn.Module):
         if ground is None:
             return tokens
         if isinstance(ground, Perception):
-            ground = self.reduce(ground).reshape(*tokens.shape[:-1], -1)
+            ground = self.reduce(ground.elevation, ground.semantic)
+            ground = ground.reshape(*tokens.shape[:-1], -1)
+        if isinstance(ground, Glance):
+            ground = ground.reduced
         return tokens + self.embed_ground(ground)
 
 
-class _Reduction(nn.Module):
-    """A `nn.Dense` on both latents, without a copy of them beside each other."""
+class Reduction(nn.Module):
+    """A `nn.Dense` on both latents of every cell, without a copy of them beside each other."""
 
     channels: int
 
     @nn.compact
-    def __call__(self, ground: Perception) -> jax.Array:
-        """`[..., 16, 16, channels]`."""
+    def __call__(self, elevation: jax.Array, semantic: jax.Array) -> jax.Array:
+        """Latents `[..., 18]` of each to `[..., channels]`."""
         shape = 2 * LATENT_CHANNELS, self.channels
         kernel = self.param("kernel", nn.linear.default_kernel_init, shape)
         bias = self.param("bias", nn.initializers.zeros, shape[1:])
         of_elevation, of_semantic = jnp.split(kernel, 2)
-        return ground.elevation @ of_elevation + ground.semantic @ of_semantic + bias
+        return elevation @ of_elevation + semantic @ of_semantic + bias

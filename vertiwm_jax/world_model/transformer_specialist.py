@@ -1,5 +1,7 @@
 """F_T: a causal Transformer over states, commands and encoded terrain (Sec. IV-B)."""
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
@@ -7,16 +9,23 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.networks.encoder import LATENT_CHANNELS
+from vertiwm_jax.networks.encoder import LATENT_CHANNELS, in_rows
 from vertiwm_jax.networks.transformer import KeyValueCache
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import motion
+from vertiwm_jax.world_model.batching import few_at_a_time
 from vertiwm_jax.world_model.normalisation import LOCAL, Normalisation
-from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception
+from vertiwm_jax.world_model.perception import (
+    TOGETHER,
+    EncoderParams,
+    Exteroception,
+    Glance,
+    Perception,
+)
 from vertiwm_jax.world_model.sizes import BASE, TransformerSize
-from vertiwm_jax.world_model.specialist_network import Ground, SpecialistNetwork
+from vertiwm_jax.world_model.specialist_network import Ground, Reduction, SpecialistNetwork
 
 
 @struct.dataclass
@@ -33,7 +42,7 @@ class TransformerHistory:
     """cache: of the past tokens; perception: of the current state, None without patches."""
 
     cache: KeyValueCache
-    perception: Perception | None
+    perception: Perception | Glance | None
 
 
 @dataclass(frozen=True)
@@ -43,11 +52,22 @@ class TransformerSpecialist:
     terrain: what it is told of the ground at the pose: encoded "patches"; the "indicator" of
         NRD (Zhang et al., 2026), 1 on soil and 0 on rigid ground; or "none".
     exteroception: how it looks at patches.
+    remembers: what its history has of a look: the "latents"; or a "glance", which takes a CPU less
+        time, but what makes it of the latents cannot be learned so: asking for a gradient raises.
     """
 
     size: TransformerSize = BASE
     terrain: Literal["patches", "indicator", "none"] = "patches"
     exteroception: Exteroception = Exteroception()
+    remembers: Literal["latents", "glance"] = "latents"
+
+    def __post_init__(self) -> None:
+        all_needed = self.terrain != "patches" or self.exteroception.tune_encoders
+        if self.remembers == "glance" and all_needed:
+            raise ValueError(
+                "remembers: expected latents without patches, or with encoders that are tuned, "
+                "found glance"
+            )
 
     def init_params(
         self, key: jax.Array, normalisation: Normalisation | None = None
@@ -68,7 +88,7 @@ class TransformerSpecialist:
     ) -> TransformerHistory:
         """An empty cache and a look at the ground."""
         empty = self._network.apply(params.network, method=SpecialistNetwork.empty_cache)
-        perception = self._look(params, terrain, state)
+        perception = self.look(params, terrain, state)
         return TransformerHistory(cast(KeyValueCache, empty), perception)
 
     def step(
@@ -81,7 +101,7 @@ class TransformerSpecialist:
     ) -> tuple[VehicleState, TransformerHistory]:
         """The next state, and a look at the ground there."""
         state, history = self.propose(params, terrain, history, state, command)
-        return state, replace(history, perception=self._look(params, terrain, state))
+        return state, replace(history, perception=self.look(params, terrain, state))
 
     def propose(
         self,
@@ -113,7 +133,7 @@ class TransformerSpecialist:
 
         What `step` gives from each of them with the history of those before, all at once.
         """
-        perception = jax.vmap(lambda state: self._look(params, terrain, state))(states)
+        perception = jax.vmap(lambda state: self.look(params, terrain, state))(states)
         inputs = self._inputs(params, terrain, states, commands, perception)
         output = cast(jax.Array, self._network.apply(params.network, *inputs))
         return motion.advance(states, params.normalisation.transition(output))
@@ -122,13 +142,26 @@ class TransformerSpecialist:
     def _network(self) -> SpecialistNetwork:
         return SpecialistNetwork(self.size)
 
-    def _look(
+    def look(
         self, params: TransformerParams, terrain: TerrainMap, state: VehicleState
-    ) -> Perception | None:
+    ) -> Perception | Glance | None:
+        """What it remembers of a look at the ground."""
         if self.terrain != "patches":
             return None
         assert params.encoders is not None, "without encoders it cannot look at patches"
-        return self.exteroception.look((params.encoders,), terrain, state)[0]
+        if self.remembers == "latents":
+            return self.exteroception.look((params.encoders,), terrain, state)[0]
+        given = jax.lax.stop_gradient((params.encoders, terrain, state))
+        return _few_glances(self)(_not_learned(params.network["params"]["reduce"]), *given)
+
+    def _glance(
+        self, reduction: Any, encoders: EncoderParams, terrain: TerrainMap, state: VehicleState
+    ) -> Glance:
+        ((elevation, semantic),) = self.exteroception.see((encoders,), terrain, state)
+        network = Reduction(self.size.channels)
+        reduced = cast(jax.Array, network.apply({"params": reduction}, elevation, semantic))
+        averaged = (jnp.mean(x, axis=(0, 1, 2)) for x in (elevation, semantic))
+        return Glance(in_rows(reduced).ravel(), jnp.concatenate([*averaged]))
 
     def _inputs(
         self,
@@ -136,7 +169,7 @@ class TransformerSpecialist:
         terrain: TerrainMap,
         state: VehicleState,
         command: Command,
-        perception: Perception | None,
+        perception: Perception | Glance | None,
     ) -> tuple[jax.Array, Ground]:
         """What the network reads: motion `[..., 10]` and the ground."""
         constants = params.normalisation
@@ -147,3 +180,21 @@ class TransformerSpecialist:
             soil = terrain.deformable[below.semantic]
             ground = soil[..., None].astype(jnp.float32)
         return jnp.concatenate(parts, axis=-1), ground
+
+
+@functools.cache  # one function for each, so that what was traced is found again
+def _few_glances(specialist: TransformerSpecialist) -> Callable[..., Glance]:
+    return few_at_a_time(specialist._glance, TOGETHER)
+
+
+@jax.custom_jvp
+def _not_learned(weights: Any) -> Any:
+    return weights
+
+
+@_not_learned.defjvp
+def _raise(primals: Any, tangents: Any) -> Any:
+    raise TypeError(
+        "remembers: expected latents to learn the weights of a Transformer, found glance; see "
+        "world_model.choice.lean"
+    )

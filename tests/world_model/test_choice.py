@@ -1,0 +1,77 @@
+"""Forms of a model that only drives."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from world_model.examples import commands, driving, one, rough
+
+from vertiwm_jax.dynamics import embedding, rollout
+from vertiwm_jax.world_model.choice import choose, lean
+from vertiwm_jax.world_model.model import ModelConfig
+from vertiwm_jax.world_model.perception import Exteroception
+from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
+
+TERRAIN, STATES, COMMANDS = rough(), driving(3, 5), commands(8)
+
+
+@partial(jax.jit, static_argnames="model")
+def drive(model, params, states):
+    def of_one(state):
+        history = model.init(params, TERRAIN, state)
+        return rollout(model, params, TERRAIN, history, state, COMMANDS)
+
+    return jax.vmap(of_one)(states)
+
+
+@pytest.mark.parametrize("name", ["vertiwm", "transformer"])
+def test_a_lean_model_drives_alike(name):
+    model, params = choose(name)
+    assert lean(model) != model and lean(lean(model)) == lean(model)
+    expected, found = (drive(m, params, STATES) for m in (model, lean(model)))
+    np.testing.assert_allclose(found.vector, expected.vector, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["builtin", "nesam", "bicycle"])
+def test_models_without_latents_are_lean_already(name):
+    model, _ = choose(name)
+    assert lean(model) == model
+
+
+def test_nesam_needs_latents_for_its_own_encoders_or_for_soils():
+    own, predicted = ModelConfig(), ModelConfig(encoders="shared", soil="predicted")
+    for config in (own, predicted):
+        assert lean(config.build()) == config.build()
+        with pytest.raises(ValueError, match="remembers: expected latents"):
+            replace(config.build(), transformer=lean(config.transformer))
+
+
+def test_what_needs_latents_is_refused():
+    with pytest.raises(ValueError, match="remembers: expected latents"):
+        TransformerSpecialist(terrain="none", remembers="glance")
+    with pytest.raises(ValueError, match="remembers: expected latents"):
+        TransformerSpecialist(exteroception=Exteroception(tune_encoders=True), remembers="glance")
+    model, params = choose("transformer")
+    with pytest.raises(ValueError, match="embeddings: expected a model that sees"):
+        embedding(jax.eval_shape(lean(model).init, params, TERRAIN, one(STATES, 0)))
+
+
+def test_a_lean_model_moves_by_its_commands_but_does_not_learn():
+    model, params = choose("transformer")
+    state = one(STATES, 0)
+
+    def away(model, network, commands):
+        given = replace(params, network=network)
+        history = model.init(given, TERRAIN, state)
+        end = rollout(model, given, TERRAIN, history, state, commands)
+        return jnp.sum(end.position[-1])
+
+    by_commands = jax.jit(jax.grad(away, argnums=2), static_argnums=0)
+    expected, found = (by_commands(m, params.network, COMMANDS) for m in (model, lean(model)))
+    np.testing.assert_allclose(found.vector, expected.vector, atol=1e-4)
+    assert np.any(expected.vector)
+    with pytest.raises(TypeError, match="remembers: expected latents to learn"):
+        jax.grad(away, argnums=1)(lean(model), params.network, COMMANDS)
