@@ -13,7 +13,6 @@ from gymnasium.utils.env_checker import check_env
 from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.gymnasium import NavigationGymEnv
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.route import RouteConfig
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.learning.dataset import Auxiliary
@@ -25,11 +24,7 @@ from vertiwm_jax.simulators.gymnasium import SimulatorEnv
 from vertiwm_jax.simulators.protocol import Observation, SimulatorError
 from vertiwm_jax.terrain import map as terrain_map
 
-# By default a way costs 11 times as much in a box, and the reward of the step into it shows 5e-6 m,
-# by which any two programs differ after a few seconds.
-CONFIG = NavigationConfig(
-    speed_range=(0.0, 5.0), horizon_seconds=6.0, route=RouteConfig(blocked=1.0)
-)
+CONFIG = NavigationConfig(speed_range=(0.0, 5.0), horizon_seconds=6.0)
 TASKS = Tasks(
     world=jnp.array([1, 1, 0, 1, 1, 0]),
     start=jnp.array([[-20.0, 0], [0, -30], [50, 0], [60, 0], [20, 20], [-20, -20]]),

@@ -421,7 +421,9 @@ def _advance_pose(
     """Moves the centre of mass by the new velocity and turns the body about it."""
     turn = geometry.rotation_from_vector(seconds * twist.angular.stacked())
     quaternion = geometry.compose(jaxlie.SO3(body.quaternion), turn).wxyz
-    at_centre = body.position.plus(axes.to_world(centre.plus(twist.linear, seconds)))
-    position = at_centre.plus(Axes.from_quaternion(quaternion).to_world(centre), -1.0)
+    at_centre = axes.to_world(centre.plus(twist.linear, seconds))
+    # Of the large number that a place may be, only one sum is rounded.
+    gone = at_centre.plus(Axes.from_quaternion(quaternion).to_world(centre), -1.0)
+    position = body.position.plus(gone)
     inertia = Vector.of(vehicle.inertia)
     return _Body(position, quaternion, turned(twist, inertia, Axes.from_quaternion(turn.wxyz)))
