@@ -6,7 +6,7 @@ in place and time and again, for new memory comes several times slower.
 """
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from benchmarks._harness import Figures, measure, parser, report
 from benchmarks.models import drives
 from vertiwm_jax.world_model import fusion
-from vertiwm_jax.world_model.choice import choose, lean
+from vertiwm_jax.world_model.choice import lean
 from vertiwm_jax.world_model.fusion import Proposal
 from vertiwm_jax.world_model.model import VertiWM
 
@@ -31,8 +31,8 @@ def over_vehicles(part: Part) -> Callable[..., Any]:
 
 def parts(batch: int) -> dict[str, Part]:
     """Every part of a step on `batch` vehicles after their first step, and the whole."""
-    model, params = choose("vertiwm")
-    model = cast(VertiWM, lean(model))
+    model, params = VertiWM.pretrained()
+    model = lean(model)
     transformer, nesam = model.transformer, model.nesam
     terrain, states, commands = drives(batch, 1)
     command = jax.tree.map(lambda x: x[:, 0], commands)

@@ -1,5 +1,6 @@
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 import scipy.linalg
@@ -131,3 +132,47 @@ def test_wrap_maps_half_a_turn_to_minus_pi():
         wrap(jnp.array([0.0, 7.0, -4.0])), [0, 7 - 2 * np.pi, 2 * np.pi - 4], atol=1e-6
     )
     np.testing.assert_allclose(jax.vmap(jax.grad(geometry.wrap))(jnp.array([0.5, 9.0])), 1.0)
+
+
+def test_rotations_compose_and_rotate_as_in_scipy():
+    rng = np.random.default_rng(3)
+    first, second = Rotation.random(50, random_state=rng), Rotation.random(50, random_state=rng)
+    ours = [
+        jaxlie.SO3(jnp.asarray(np.roll(r.as_quat(), 1, axis=-1), jnp.float32))
+        for r in (first, second)
+    ]
+    points = rng.uniform(-2, 2, (50, 3)).astype(np.float32)
+    both = geometry.compose(*ours)
+    np.testing.assert_allclose(both.as_matrix(), (first * second).as_matrix(), atol=5 * EPSILON)
+    np.testing.assert_allclose(jnp.linalg.norm(both.wxyz, axis=-1), 1, atol=2 * EPSILON)
+    np.testing.assert_allclose(
+        geometry.rotate(ours[0], points), first.apply(points), atol=20 * EPSILON
+    )
+
+
+@bounded
+@given(axis=direction, angle=st.floats(-3.1, 3.1))
+def test_a_rotation_from_a_vector_is_that_of_exp(axis, angle):
+    omega = np.float32(angle * axis)
+    found = geometry.rotation_from_vector(jnp.asarray(omega)).as_matrix()
+    np.testing.assert_allclose(found, Rotation.from_rotvec(omega).as_matrix(), atol=5 * EPSILON)
+
+
+def test_a_moved_pose_is_the_product_with_the_increment():
+    rng = np.random.default_rng(4)
+    position, xi = rng.uniform(-5, 5, (20, 3)), rng.uniform(-1, 1, (20, 6))
+    rpy = rng.uniform(-1, 1, (20, 3))
+    moved, turned = geometry.moved(*(jnp.asarray(x, jnp.float32) for x in (position, rpy, xi)))
+    for i in range(20):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", rpy[i]).as_matrix(), position[i]
+        expected = pose @ reference_exp(xi[i])
+        np.testing.assert_allclose(moved[i], expected[:3, 3], atol=2e-6)
+        np.testing.assert_allclose(rpy_matrix(turned[i]), expected[:3, :3], atol=1e-6)
+
+
+def test_log_is_finite_with_its_gradient_at_half_a_turn():
+    half = jaxlie.SE3(jnp.array([0.0, 1.0, 0.0, 0.0, 0.3, -0.2, 0.1]))
+    gradient = jax.jacfwd(lambda p: geometry.log(jaxlie.SE3(p)))(half.wxyz_xyz)
+    assert np.isfinite(gradient).all()
+    np.testing.assert_allclose(geometry.log(half)[3:], [np.pi, 0, 0], atol=1e-6)

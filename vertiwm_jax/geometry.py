@@ -5,7 +5,7 @@ rotation second, as in the paper's Log (Eq. 3). Roll, pitch and yaw are
 R = Rz(yaw) Ry(pitch) Rx(roll): positive pitch is nose down.
 
 What every step of a model needs is written out by components (see `vector`): jaxlie's own products
-gather them from arrays, which takes a CPU several times as long, and XLA as long to compile.
+gather them from arrays, of which XLA makes a kernel each.
 """
 
 import jax
@@ -31,7 +31,7 @@ def rotation_from_rpy(rpy: jax.Array) -> jaxlie.SO3:
     sx, sy, sz = Vector.of(jnp.sin(0.5 * rpy))
     w, x = cx * cy * cz + sx * sy * sz, sx * cy * cz - cx * sy * sz
     y, z = cx * sy * cz + sx * cy * sz, cx * cy * sz - sx * sy * cz
-    return jaxlie.SO3(jnp.stack([w, x, y, z], axis=-1))
+    return _rotation(w, Vector(x, y, z))
 
 
 def rpy_from_rotation(rotation: jaxlie.SO3) -> jax.Array:
@@ -52,17 +52,25 @@ def pose_from_rpy(position: jax.Array, rpy: jax.Array) -> jaxlie.SE3:
 
 def compose(first: jaxlie.SO3, second: jaxlie.SO3) -> jaxlie.SO3:
     """The rotation first @ second, of unit length again."""
-    w, *v = jnp.moveaxis(first.wxyz, -1, 0)
-    u, *t = jnp.moveaxis(second.wxyz, -1, 0)
-    a, b = Vector(*v), Vector(*t)
+    (w, a), (u, b) = _parts(first), _parts(second)
     real, imaginary = w * u - a.dot(b), a.times(u).plus(b, w).plus(a.cross(b))
     scale = jax.lax.rsqrt(real**2 + imaginary.dot(imaginary))
-    return jaxlie.SO3(scale[..., None] * jnp.stack([real, *imaginary], axis=-1))
+    return _rotation(scale * real, imaginary.times(scale))
 
 
 def rotate(rotation: jaxlie.SO3, v: jax.Array) -> jax.Array:
     """Vectors `[..., 3]` turned by a rotation."""
     return Axes.from_quaternion(rotation.wxyz).to_world(Vector.of(v)).stacked()
+
+
+def moved(position: jax.Array, rpy: jax.Array, xi: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Position `[..., 3]`, m, and roll, pitch, yaw, rad, of T Exp(xi), for those of T.
+
+    xi: `[..., 6]` tangent in the frame of T.
+    """
+    rotation, step = rotation_from_rpy(rpy), exp(xi)
+    turned = rpy_from_rotation(compose(rotation, step.rotation()))
+    return position + rotate(rotation, step.translation()), turned
 
 
 def exp(xi: jax.Array) -> jaxlie.SE3:
@@ -84,7 +92,7 @@ def exp(xi: jax.Array) -> jaxlie.SE3:
     )
     once = omega.cross(v)
     translation = v.plus(once, a).plus(omega.cross(once), b).stacked()
-    rotation = rotation_from_vector(xi[..., 3:])
+    rotation = _rotation(cos, omega.times(sinc))
     return jaxlie.SE3.from_rotation_and_translation(rotation, translation)
 
 
@@ -92,7 +100,17 @@ def rotation_from_vector(omega: jax.Array) -> jaxlie.SO3:
     """`[..., 3]` axis times angle in rad to a rotation."""
     axis = Vector.of(omega)
     _, cos, sinc = _half(axis)
-    return jaxlie.SO3(jnp.stack([cos, *axis.times(sinc)], axis=-1))
+    return _rotation(cos, axis.times(sinc))
+
+
+def _rotation(real: jax.Array, imaginary: Vector) -> jaxlie.SO3:
+    return jaxlie.SO3(jnp.stack([real, *imaginary], axis=-1))
+
+
+def _parts(rotation: jaxlie.SO3) -> tuple[jax.Array, Vector]:
+    """Of a rotation's quaternion: what `_rotation` puts together."""
+    real, *imaginary = jnp.moveaxis(rotation.wxyz, -1, 0)
+    return real, Vector(*imaginary)
 
 
 def _half(omega: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -111,16 +129,16 @@ def log(pose: jaxlie.SE3) -> jax.Array:
 
     The translation is v - w x v / 2 + c (w x (w x v)) with c = (1 - (t/2) cot(t/2))/t^2.
     """
-    real, *imaginary = jnp.moveaxis(pose.rotation().wxyz, -1, 0)
-    axis, translation = Vector(*imaginary), Vector.of(pose.translation())
+    (real, axis), translation = _parts(pose.rotation()), Vector.of(pose.translation())
     square = axis.dot(axis)
     small = square < _SMALL / 4  # sin^2 of half the angle
     sin = jnp.sqrt(jnp.where(small, 1.0, square))
     # Of both quaternions of a rotation, the one that turns by less than half a turn.
     sign, cos = jnp.where(real < 0, -1.0, 1.0), jnp.abs(real)
-    tan2 = square / jnp.where(small, real, 1.0) ** 2
     half = jnp.where(small, 1.0, jnp.arctan2(sin, cos))
-    series = (1 - tan2 / 3 + tan2**2 / 5) / jnp.where(small, cos, 1.0)
+    safe = jnp.where(small, cos, 1.0)
+    tan2 = square / safe**2
+    series = (1 - tan2 / 3 + tan2**2 / 5) / safe
     omega = axis.times(2 * sign * jnp.where(small, series, half / sin))
     turn = omega.dot(omega)
     c = jnp.where(

@@ -44,10 +44,9 @@ class ProceduralNavigation(NavigationEnv):
         **settings,
     ) -> Self:
         """The environment in a model of `world_model.choice`, with any of the other settings."""
-        dynamics = choose(model)[0]
-        if not config.embeddings:
-            dynamics = lean(dynamics)
-        return cls(dynamics, config, model=model, **settings)
+        dynamics, _ = choose(model)
+        seen = dynamics if config.embeddings else lean(dynamics)
+        return cls(seen, config, model=model, **settings)
 
     @property
     def default_params(self) -> NavigationParams:

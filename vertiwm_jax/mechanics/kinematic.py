@@ -29,9 +29,8 @@ class ConstantVelocity:
         command: Command,
     ) -> tuple[VehicleState, tuple[()]]:
         twist = jnp.concatenate([state.velocity, state.angular_velocity], axis=-1)
-        pose = state.pose @ geometry.exp(STEP_SECONDS * twist)
-        rpy = geometry.rpy_from_rotation(pose.rotation())
-        return replace(state, position=pose.translation(), rpy=rpy), ()
+        position, rpy = geometry.moved(state.position, state.rpy, STEP_SECONDS * twist)
+        return replace(state, position=position, rpy=rpy), ()
 
 
 @struct.dataclass

@@ -1,20 +1,26 @@
 """Batches in an order that keeps what is computed in the cache of a core."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
+from functools import cache, partial
 from typing import Any
 
 import jax
 from jax.custom_batching import custom_vmap
 
 
-def few_at_a_time(function: Callable[..., Any], number: int) -> Callable[..., Any]:
+@cache  # one for each, so that what was traced is found again
+def few_at_a_time(
+    function: Callable[..., Any], number: int, *static: Hashable
+) -> Callable[..., Any]:
     """`function` of one vehicle, whose batches a CPU computes about `number` vehicles at a time.
 
+    static: its first arguments, the others are given in calls.
     The result is that of `vmap`, which computes one operation of all vehicles after the other:
     where every vehicle needs hundreds of kB, all of it goes to memory and back between any two. For
     pure functions of arrays that no gradient flows through; other platforms take all at once.
     """
-    function = jax.jit(function, inline=True)  # Both ways to compute many share its trace.
+    # Both ways to compute many share its trace.
+    function = jax.jit(partial(function, *static), inline=True)
     of_one = custom_vmap(function)
 
     @of_one.def_vmap

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, Params
@@ -14,6 +14,8 @@ from vertiwm_jax.world_model.model import ModelConfig, VertiWM
 from vertiwm_jax.world_model.nesam import Nesam, SoilSource
 from vertiwm_jax.world_model.perception import Eyes, Sighted, SightedParams
 from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
+
+D = TypeVar("D", bound=Dynamics)
 
 ModelName = Literal["builtin", "transformer", "nesam", "vertiwm"]
 """The simulator, which has learned nothing; either specialist; both of them fused."""
@@ -80,7 +82,7 @@ def exact(dynamics: Dynamics) -> Dynamics:
     return dynamics
 
 
-def lean(dynamics: Dynamics) -> Dynamics:
+def lean(dynamics: D) -> D:
     """The same model, which remembers no latents where nothing needs them, to drive and to plan.
 
     A step takes a CPU less time. Values are the same, to rounding; `dynamics.embedding` has none.

@@ -51,11 +51,11 @@ def twist(state: VehicleState) -> jax.Array:
 
 def moved(state: VehicleState, increment: jax.Array, twist: jax.Array) -> VehicleState:
     """The state T Exp(xi) with nu: increment `[..., 6]` m and rad, twist `[..., 6]`."""
-    before, relative = geometry.rotation_from_rpy(state.rpy), geometry.exp(increment)
+    position, rpy = geometry.moved(state.position, state.rpy, increment)
     return replace(
         state,
-        position=state.position + geometry.rotate(before, relative.translation()),
-        rpy=geometry.rpy_from_rotation(geometry.compose(before, relative.rotation())),
+        position=position,
+        rpy=rpy,
         velocity=twist[..., :3],
         angular_velocity=twist[..., 3:],
     )

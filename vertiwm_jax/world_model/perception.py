@@ -1,7 +1,5 @@
 """What a model perceives of the ground at a pose: queried patches and their latents (Eq. 2)."""
 
-import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
@@ -40,8 +38,12 @@ class Perception:
     @property
     def averaged(self) -> jax.Array:
         """`[..., 36]` the mean of every channel over space, e of Eq. 5."""
-        means = (jnp.mean(x, axis=(-3, -2)) for x in (self.elevation, self.semantic))
-        return jnp.concatenate([*means], axis=-1)
+        return averages((-3, -2), self.elevation, self.semantic)
+
+
+def averages(axes: tuple[int, ...], *latents: jax.Array) -> jax.Array:
+    """The means of latents `[..., 18]` over axes, side by side."""
+    return jnp.concatenate([jnp.mean(x, axis=axes) for x in latents], axis=-1)
 
 
 @struct.dataclass
@@ -95,7 +97,7 @@ class Exteroception:
             patches = self.query(terrain, state)
             return tuple(self.encode(params, patches) for params in encoders)
         given = jax.lax.stop_gradient((encoders, terrain, state))
-        return _few_looks(self)(*given)
+        return few_at_a_time(Exteroception._look, TOGETHER, self)(*given)
 
     def _look(
         self, encoders: tuple[EncoderParams, ...], terrain: TerrainMap, state: VehicleState
@@ -144,11 +146,6 @@ class Exteroception:
 
 def _of_fours(encoder: TerrainEncoder, params: Any, projected: jax.Array) -> jax.Array:
     return cast(jax.Array, encoder.apply(params, projected, method=TerrainEncoder.of_fours))
-
-
-@functools.cache  # one function for each, so that what was traced is found again
-def _few_looks(exteroception: Exteroception) -> Callable[..., tuple[Perception, ...]]:
-    return few_at_a_time(exteroception._look, TOGETHER)
 
 
 @struct.dataclass

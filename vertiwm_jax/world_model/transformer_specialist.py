@@ -1,7 +1,5 @@
 """F_T: a causal Transformer over states, commands and encoded terrain (Sec. IV-B)."""
 
-import functools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
@@ -23,6 +21,7 @@ from vertiwm_jax.world_model.perception import (
     Exteroception,
     Glance,
     Perception,
+    averages,
 )
 from vertiwm_jax.world_model.sizes import BASE, TransformerSize
 from vertiwm_jax.world_model.specialist_network import Ground, Reduction, SpecialistNetwork
@@ -152,7 +151,8 @@ class TransformerSpecialist:
         if self.remembers == "latents":
             return self.exteroception.look((params.encoders,), terrain, state)[0]
         given = jax.lax.stop_gradient((params.encoders, terrain, state))
-        return _few_glances(self)(_not_learned(params.network["params"]["reduce"]), *given)
+        glance = few_at_a_time(TransformerSpecialist._glance, TOGETHER, self)
+        return glance(_not_learned(params.network["params"]["reduce"]), *given)
 
     def _glance(
         self, reduction: Any, encoders: EncoderParams, terrain: TerrainMap, state: VehicleState
@@ -160,8 +160,7 @@ class TransformerSpecialist:
         ((elevation, semantic),) = self.exteroception.see((encoders,), terrain, state)
         network = Reduction(self.size.channels)
         reduced = cast(jax.Array, network.apply({"params": reduction}, elevation, semantic))
-        averaged = (jnp.mean(x, axis=(0, 1, 2)) for x in (elevation, semantic))
-        return Glance(in_rows(reduced).ravel(), jnp.concatenate([*averaged]))
+        return Glance(in_rows(reduced).ravel(), averages((0, 1, 2), elevation, semantic))
 
     def _inputs(
         self,
@@ -180,11 +179,6 @@ class TransformerSpecialist:
             soil = terrain.deformable[below.semantic]
             ground = soil[..., None].astype(jnp.float32)
         return jnp.concatenate(parts, axis=-1), ground
-
-
-@functools.cache  # one function for each, so that what was traced is found again
-def _few_glances(specialist: TransformerSpecialist) -> Callable[..., Glance]:
-    return few_at_a_time(specialist._glance, TOGETHER)
 
 
 @jax.custom_jvp
