@@ -200,6 +200,5 @@ def with_embedding(observation: jax.Array, embedding: jax.Array) -> jax.Array:
     Tile by tile, so that networks, which read it many times, need not put it in that order.
     """
     # What a model sees where it has diverged may be anything.
-    finite = jnp.nan_to_num(tiles(embedding).ravel())
-    clipped = jnp.clip(finite, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
-    return jnp.concatenate([observation, clipped])
+    clipped = jnp.clip(jnp.nan_to_num(embedding), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+    return jnp.concatenate([observation, tiles(clipped).ravel()])

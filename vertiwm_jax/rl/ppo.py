@@ -124,7 +124,7 @@ class Transitions:
 
 @struct.dataclass
 class Batch:
-    """What the loss is made of, `[B]`; `observation` is normalised, `target` a lambda return.
+    """What the loss is made of, `[B]`; `observation` is not normalised, `target` a lambda return.
 
     advantage: in the loss, normalised over its minibatch.
     """
@@ -186,7 +186,11 @@ class PPO:
                 returns = returns.update(experience.discounted_return)
             if self.config.normalise_observations:
                 # From the next iteration on: within one, all are normalised alike.
-                observations = observations.update(experience.observation)
+                observations, _ = jax.lax.scan(
+                    lambda known, seen: (known.update(seen), None),
+                    observations,
+                    experience.observation,
+                )
             batch = self._batch(state, returns, transitions)
         with jax.named_scope("update"):
             params, optimiser, losses = self._update(env_params, state, batch, update_key)
@@ -264,8 +268,12 @@ class PPO:
     ) -> Batch:
         """Transitions `[T, N]` to the flat batch `[T N]` of the loss."""
         experience = transitions.experience
-        observation = state.observations.normalise(experience.observation)
-        value = self._value(state.params, observation)
+
+        def value_of(observation: jax.Array) -> jax.Array:
+            return self._value(state.params, state.observations.normalise(observation))
+
+        # Step by step, as statistics are updated: copies of all observations take long to write.
+        value = jax.lax.map(value_of, experience.observation)
         advantage = generalised_advantages(
             experience.reward / returns.std,
             value,
@@ -276,7 +284,7 @@ class PPO:
             self.config.trace,
         )
         batch = Batch(
-            observation=observation,
+            observation=experience.observation,
             action=experience.action,
             log_prob=transitions.log_prob,
             value=value,
@@ -294,13 +302,14 @@ class PPO:
         actor, optimiser = self._actor(env_params), self._optimiser
 
         def loss(params: Params, batch: Batch) -> tuple[jax.Array, Metrics]:
-            policy = cast(Gaussian, actor.apply(params["actor"], batch.observation))
+            seen = state.observations.normalise(batch.observation)
+            policy = cast(Gaussian, actor.apply(params["actor"], seen))
             log_ratio = policy.log_prob(batch.action) - batch.log_prob
             ratio = jnp.exp(log_ratio)
             clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
             policy_loss = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
 
-            value = self._value(params, batch.observation)
+            value = self._value(params, seen)
             error = (value - batch.target) ** 2
             if config.value_clip is not None:
                 change = jnp.clip(value - batch.value, -config.value_clip, config.value_clip)
