@@ -32,6 +32,8 @@ class RunningStatistics:
     def update(self, samples: jax.Array) -> Self:
         """Adds `[B..., ...]` samples (any leading axes), by Chan et al. (1979), eq. 2.1."""
         batch = samples.shape[: samples.ndim - self.mean.ndim]
+        if len(batch) > 1:  # in turns: intermediate results of all take long to write
+            return jax.lax.scan(lambda known, x: (known.update(x), None), self, samples)[0]
         added = math.prod(batch)
 
         def average(x: jax.Array) -> jax.Array:

@@ -114,11 +114,13 @@ class TrainState:
 class Transitions:
     """Steps as collected, `[T, N]`, and what the networks of that time made of them.
 
-    log_prob: of the actions, which are not clipped; next_value: of what was seen after the step.
+    log_prob: of the actions, which are not clipped; value, next_value: of what was seen before and
+        after the step.
     """
 
     experience: Experience
     log_prob: jax.Array
+    value: jax.Array
     next_value: jax.Array
 
 
@@ -186,11 +188,7 @@ class PPO:
                 returns = returns.update(experience.discounted_return)
             if self.config.normalise_observations:
                 # From the next iteration on: within one, all are normalised alike.
-                observations, _ = jax.lax.scan(
-                    lambda known, seen: (known.update(seen), None),
-                    observations,
-                    experience.observation,
-                )
+                observations = observations.update(experience.observation)
             batch = self._batch(state, returns, transitions)
         with jax.named_scope("update"):
             params, optimiser, losses = self._update(env_params, state, batch, update_key)
@@ -257,8 +255,9 @@ class PPO:
             running, experience, final = environments.step(
                 self.env, env_params, self.outcomes, config.discount, running, action, step_key
             )
-            value = self._value(state.params, state.observations.normalise(final))
-            return running, Transitions(experience, policy.log_prob(action), value)
+            value = self._value(state.params, seen)
+            next_value = self._value(state.params, state.observations.normalise(final))
+            return running, Transitions(experience, policy.log_prob(action), value, next_value)
 
         keys = jax.random.split(key, self.config.num_steps)
         return jax.lax.scan(advance, state.environments, keys)
@@ -268,15 +267,9 @@ class PPO:
     ) -> Batch:
         """Transitions `[T, N]` to the flat batch `[T N]` of the loss."""
         experience = transitions.experience
-
-        def value_of(observation: jax.Array) -> jax.Array:
-            return self._value(state.params, state.observations.normalise(observation))
-
-        # Step by step, as statistics are updated: copies of all observations take long to write.
-        value = jax.lax.map(value_of, experience.observation)
         advantage = generalised_advantages(
             experience.reward / returns.std,
-            value,
+            transitions.value,
             transitions.next_value,
             experience.terminated,
             experience.truncated,
@@ -287,9 +280,9 @@ class PPO:
             observation=experience.observation,
             action=experience.action,
             log_prob=transitions.log_prob,
-            value=value,
+            value=transitions.value,
             advantage=advantage,
-            target=advantage + value,
+            target=advantage + transitions.value,
         )
         # Minibatches have rows of all environments.
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), devices.whole(batch))
@@ -302,6 +295,7 @@ class PPO:
         actor, optimiser = self._actor(env_params), self._optimiser
 
         def loss(params: Params, batch: Batch) -> tuple[jax.Array, Metrics]:
+            # Not before: copies of all observations take long to write.
             seen = state.observations.normalise(batch.observation)
             policy = cast(Gaussian, actor.apply(params["actor"], seen))
             log_ratio = policy.log_prob(batch.action) - batch.log_prob
