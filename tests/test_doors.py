@@ -22,6 +22,7 @@ from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
+from vertiwm_jax.rl.planning import PlanningConfig
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
@@ -258,6 +259,28 @@ def test_a_policy_of_a_known_map_drives_on_one_that_is_revealed(run, monkeypatch
     env, params, policies, *_ = found.value.args
     assert env.config.reveal.range == 12.0 and params.starts.belief is not None
     assert any(name.startswith("ppo") for name in policies)
+
+
+@pytest.mark.parametrize("planning", [True, False, None])
+def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path, monkeypatch):
+    def drive(*arguments):
+        raise Driven(*arguments)
+
+    monkeypatch.setattr(evaluate.report, "drive", drive)
+    (tmp_path / "checkpoints").symlink_to(run / "checkpoints")
+    for of_run in (PlanningConfig(candidates=3), None):
+        config = replace(configuration.load(PPOTraining, run / "config.yaml"), planning=of_run)
+        configuration.save(config, tmp_path / "config.yaml")
+        asked = [] if planning is None else ["--planning", str(planning)]
+        with pytest.raises(Driven) as found:
+            evaluate.main(["navigation", "--policy", str(tmp_path), *asked])
+        policies = found.value.args[2]
+        plans = bool(of_run) if planning is None else planning
+        assert ("ppo with planning" in policies) == plans and "ppo" in policies
+        if plans:
+            assert policies["ppo with planning"].config == (of_run or PlanningConfig())
+    message = refusal(evaluate.main, "navigation", "--policy", "mppi", "--planning", True)
+    assert "planning: is of the policy of a run, found mppi" in message
 
 
 def test_a_policy_drives_another_vehicle(run, tmp_path, capsys):

@@ -39,6 +39,7 @@ from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import ground, task
 from vertiwm_jax.rl.ground import Suite
 from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
+from vertiwm_jax.rl.planning import PlanningConfig
 from vertiwm_jax.rl.shooting import Shooting, ShootingConfig
 from vertiwm_jax.runs import RunError
 from vertiwm_jax.sac import SACTraining
@@ -153,6 +154,8 @@ class Navigation:
     """How it plans, and in which model, whatever moves the vehicle."""
     shooting: ShootingConfig = ShootingConfig()
     """The same of planning by gradients."""
+    planning: bool | None = None
+    """Whether the policy of a run drives a second time, planning; by default as its run says."""
     simulator: Arena = "builtin"
     """What moves the vehicle; Chrono needs PyChrono, and moves one in each process."""
     jobs: int = 1
@@ -183,6 +186,8 @@ class Navigation:
             raise ValueError(f"{found[0]}: is of procedural worlds, give it or worlds")
         if self.obstacles and not self.worlds:
             raise ValueError("obstacles: is of given worlds; procedural ones are a suite")
+        if self.planning and not isinstance(self.policy, Path):
+            raise ValueError(f"planning: is of the policy of a run, found {self.policy}")
         if self.jobs < 1 or (self.jobs > 1 and self.simulator != "chrono"):
             raise ValueError("jobs: expected 1 or more, and 1 in all simulators but Chrono")
 
@@ -301,6 +306,9 @@ def _navigate(command: Navigation) -> None:
     if run:
         # Checkpoints hold episodes, which know as much of the map as in training.
         own = replace(config, navigation=trained.navigation)
+        if command.planning is not None:
+            planning = own.planning or PlanningConfig()
+            own = replace(own, planning=planning if command.planning else None)
         policies = policy_training.learned(own, terrain, run) | policies
     elif command.policy == "mppi":
         dynamics, weights = task.dynamics(config, command.mppi.model)

@@ -9,6 +9,8 @@ from env.worlds import bicycle_env, ground, hills
 from flax import struct
 from scipy.stats import binomtest
 
+from vertiwm_jax import devices
+from vertiwm_jax.env.driver import Driver
 from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import Ending
@@ -55,6 +57,57 @@ def test_agrees_with_a_loop_over_episodes(short, straight):
         np.testing.assert_allclose(path, positions, atol=1e-2)
         left = np.linalg.norm(positions[-1] - np.asarray(state.goal))
         np.testing.assert_allclose(straight.final_distance[task], left, atol=1e-2)
+
+
+@struct.dataclass
+class Wandering(Driver):
+    """Goes to the goal, but to a side, which it decides at random and by where it is."""
+
+    interval = 7
+
+    def start(self, params, state):
+        return jnp.float32(0)
+
+    def decide(self, params, memory, observation, state, key):
+        jax.debug.callback(decided.append, state.time)
+        return 0.3 * memory + 0.3 * jax.random.normal(key) + 0.01 * state.vehicle.position[1]
+
+    def act(self, params, memory, observation, state, key):
+        return StraightToGoal(CONFIG)(observation, key).at[1].add(memory), memory
+
+
+decided = []
+
+
+@pytest.mark.parametrize("together", [1, 4, 100])
+def test_decides_for_each_that_drives_as_if_it_were_alone(short, together, monkeypatch):
+    monkeypatch.setattr(navigation, "_TOGETHER", together)
+    jax.clear_caches()  # Or what was compiled for others together would be found.
+    decided.clear()
+    env, params = short
+    wandering, key, interval = Wandering(), jax.random.key(3), Wandering.interval
+    found = jax.block_until_ready(navigation.evaluate(env, params, wandering, key))
+    jax.effects_barrier()
+    assert len(set(found.steps.tolist())) > 2  # Some drive on where others have ended.
+    # Nothing is decided where all that decide together have ended.
+    turn = min(together * devices.mesh(params.pool_size).size, params.pool_size)
+    driving = [sum(found.steps > time) for time in range(0, max(found.steps), interval)]
+    assert len(decided) == sum(-(-number // turn) * turn for number in driving)
+    step, length = jax.jit(env.step_env), int(params.max_steps_in_episode)
+    for task in range(params.pool_size):
+        observation, state = env.start(params, task)
+        memory, time = wandering.start(params, state), 0
+        while state.ending == Ending.RUNNING:
+            if time % interval == 0:
+                deciding = jax.random.fold_in(jax.random.fold_in(key, length), time)
+                own = jax.random.split(deciding, params.pool_size)[task]
+                memory = wandering.decide(params, memory, observation, state, own)
+            action, memory = wandering.act(params, memory, observation, state, key)
+            observation, state, *_ = step(key, state, action, params)
+            time += 1
+        assert (found.ending[task], found.steps[task]) == (state.ending, time)
+        end = found.path(task)[0][-1]
+        np.testing.assert_allclose(end, state.vehicle.position, atol=1e-2)
 
 
 def test_summary_counts(straight):

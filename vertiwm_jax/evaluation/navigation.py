@@ -18,6 +18,8 @@ from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.state import STEP_SECONDS
 
+_TOGETHER = 8  # vehicles that a device decides for at a time
+
 
 @struct.dataclass
 class NavigationResult:
@@ -86,17 +88,6 @@ def _evaluate(
     )
 
     @partial(devices.spread, in_axes=(None, None, 0, 0, 0, 0))
-    def decide(
-        driver: Driver,
-        params: NavigationParams,
-        memory: Any,
-        observation: jax.Array,
-        state: NavigationState,
-        key: jax.Array,
-    ) -> Any:
-        return driver.decide(params, memory, observation, state, key)
-
-    @partial(devices.spread, in_axes=(None, None, 0, 0, 0, 0))
     def drive(
         driver: Driver,
         params: NavigationParams,
@@ -121,7 +112,7 @@ def _evaluate(
     def drive_on(carry: tuple) -> tuple:
         step, memory, observation, state, paths = carry
         keys = jax.random.split(jax.random.fold_in(deciding, step), count)
-        memory = decide(driver, params, memory, observation, state, keys)
+        memory = _decide(driver, params, memory, observation, state, keys)
         carry = step, memory, observation, state, paths
         return jax.lax.scan(advance, carry, length=driver.interval)[0]
 
@@ -156,6 +147,39 @@ def _evaluate(
         position=jnp.swapaxes(position, 0, 1),
         rpy=jnp.swapaxes(rpy, 0, 1),
     )
+
+
+def _decide(
+    driver: Driver,
+    params: NavigationParams,
+    memory: Any,
+    observation: jax.Array,
+    state: NavigationState,
+    keys: jax.Array,
+) -> Any:
+    """Memories, leaves `[P, ...]`, with what those intend that still drive.
+
+    Planners imagine many futures of each vehicle, so that a few at a time fill the devices, and
+    none are imagined once a task is over.
+    """
+    running = state.ending == Ending.RUNNING
+    together = min(_TOGETHER * devices.number(), len(running))
+    turns = -(-len(running) // together)
+    filled = np.minimum(np.arange(turns * together), len(running) - 1)
+    rows = jnp.argsort(~running)[filled].reshape(turns, together)
+    decide = devices.spread(type(driver).decide, (None, None, 0, 0, 0, 0))
+
+    def turn(_: None, rows: jax.Array) -> tuple[None, Any]:
+        of_some = jax.tree.map(lambda x: x[rows], (memory, observation, state, keys))
+        return None, jax.lax.cond(
+            jnp.any(running[rows]),
+            lambda some: decide(driver, params, *some),
+            lambda some: some[0],
+            of_some,
+        )
+
+    decided = jax.lax.scan(turn, None, rows)[1]
+    return jax.tree.map(lambda x, y: x.at[rows].set(y, mode="promise_in_bounds"), memory, decided)
 
 
 @dataclasses.dataclass(frozen=True)
