@@ -279,8 +279,8 @@ def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path, monkey
         assert ("ppo with planning" in policies) == plans and "ppo" in policies
         if plans:
             assert policies["ppo with planning"].config == (of_run or PlanningConfig())
-    message = refusal(evaluate.main, "navigation", "--policy", "mppi", "--planning", True)
-    assert "planning: is of the policy of a run, found mppi" in message
+    with pytest.raises(ValueError, match="planning: is of the policy of a run, found mppi"):
+        evaluate.Navigation("mppi", planning=True)
 
 
 def test_a_policy_drives_another_vehicle(run, tmp_path, capsys):
