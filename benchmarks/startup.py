@@ -1,6 +1,7 @@
 """Seconds from the start of a training to its first iteration, without and with compiled programs.
 
-Each start is a process of its own; the second finds the programs that the first has compiled.
+Each start is a process of its own; the second finds the programs that the first has compiled. Of
+every phase it also says what JAX traced and lowered, in Python, and what XLA compiled, or read.
 """
 
 import json
@@ -12,17 +13,33 @@ import time
 
 from benchmarks._harness import Figures, parser, report
 
+_EVENTS = {
+    "/jax/core/compile/jaxpr_trace_duration": "tracing_s",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration": "lowering_s",
+    "/jax/core/compile/backend_compile_duration": "compiling_s",
+}
+_LAST = "first iteration"
 
-def phases(name: str) -> dict[str, float]:
+
+def phases(name: str) -> dict[str, dict[str, float]]:
     """Seconds of each phase of the start of the training that the configuration describes."""
-    seconds, start = {}, time.perf_counter()
+    found, start = {}, time.perf_counter()
+    spent = dict.fromkeys(_EVENTS.values(), 0.0)
+
+    def note(event: str, duration: float, **_: object) -> None:
+        if event in _EVENTS:
+            spent[_EVENTS[event]] += duration
 
     def lap(phase: str) -> None:
         nonlocal start
-        seconds[phase], start = time.perf_counter() - start, time.perf_counter()
+        now = time.perf_counter()
+        found[phase] = {"all_s": now - start, **spent}
+        start = now
+        spent.update(dict.fromkeys(spent, 0.0))
 
     import jax
 
+    jax.monitoring.register_event_duration_secs_listener(note)
     from vertiwm_jax import config as configuration
     from vertiwm_jax import devices, training
     from vertiwm_jax.env.navigation import NavigationEnv
@@ -30,36 +47,38 @@ def phases(name: str) -> dict[str, float]:
     from vertiwm_jax.rl import task
     from vertiwm_jax.rl.loop import Seeds
 
-    lap("import_s")
+    lap("import")
     training.keep_compiled(None)  # in the folder of the environment
     config = configuration.load(PPOTraining, configuration.default_config(name))
     terrain, pool, _ = jax.block_until_ready(task.training_ground(config))
     devices.forget_programs()
-    lap("worlds_s")
+    lap("worlds")
     dynamics, weights = task.dynamics(config, config.model)
     env = NavigationEnv(dynamics, config.asked, config.variation)
     algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
     training.compiled(algorithm, env.shapes(weights, terrain, pool), batch)
-    lap("compile_s")
+    lap("compile")
     params = jax.block_until_ready(env.make_params(weights, terrain, pool))
     devices.forget_programs()
-    lap("starts_s")
+    lap("starts")
     state = training.begin(algorithm, params, config.key("training"))
     iterate = training.compiled(algorithm, params, batch)
     params, state = devices.everywhere(devices.mesh(batch), (params, state))
-    lap("weights_s")
+    lap("weights")
     jax.block_until_ready(iterate(params, state))
-    lap("first_iteration_s")
-    return seconds
+    lap(_LAST)
+    return found
 
 
-def in_a_process(name: str, compiled: str) -> Figures:
-    """`phases` in a new process that keeps compiled programs in a folder."""
+def in_a_process(name: str, compiled: str) -> dict[str, Figures]:
+    """`phases` in a new process that keeps compiled programs in a folder, and their sum."""
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": compiled}
     command = [sys.executable, "-m", "benchmarks.startup", "--phases", "--config", name]
     done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
     found = json.loads(done.stdout.splitlines()[-1])
-    return {"until_first_iteration_s": sum(found.values()) - found["first_iteration_s"], **found}
+    before = [found[phase] for phase in found if phase != _LAST]
+    total = {part: sum(phase[part] for phase in before) for part in found[_LAST]}
+    return {f"until the {_LAST}": total, **found}
 
 
 def main() -> None:
@@ -72,7 +91,11 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory() as compiled:
         cases = ("nothing compiled before", "everything compiled before")
-        results = {case: in_a_process(chosen.config, compiled) for case in cases}
+        results = {
+            f"{case}: {phase}": figures
+            for case in cases
+            for phase, figures in in_a_process(chosen.config, compiled).items()
+        }
     report("startup", results, chosen.json)
 
 

@@ -248,11 +248,18 @@ class Driven(Exception):
     """What was about to be driven."""
 
 
-def test_a_policy_of_a_known_map_drives_on_one_that_is_revealed(run, monkeypatch):
+@pytest.fixture
+def nothing_driven(monkeypatch):
+    """Raises `Driven` where anything would be."""
+
     def drive(*arguments):
         raise Driven(*arguments)
 
     monkeypatch.setattr(evaluate.report, "drive", drive)
+
+
+@pytest.mark.usefixtures("nothing_driven")
+def test_a_policy_of_a_known_map_drives_on_one_that_is_revealed(run):
     navigate = ["navigation", "--policy", str(run), "--suites", "easy", "--reveal-range", "12"]
     with pytest.raises(Driven) as found:
         evaluate.main(navigate)
@@ -261,12 +268,9 @@ def test_a_policy_of_a_known_map_drives_on_one_that_is_revealed(run, monkeypatch
     assert any(name.startswith("ppo") for name in policies)
 
 
+@pytest.mark.usefixtures("nothing_driven")
 @pytest.mark.parametrize("planning", [True, False, None])
-def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path, monkeypatch):
-    def drive(*arguments):
-        raise Driven(*arguments)
-
-    monkeypatch.setattr(evaluate.report, "drive", drive)
+def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path):
     (tmp_path / "checkpoints").symlink_to(run / "checkpoints")
     for of_run in (PlanningConfig(candidates=3), None):
         config = replace(configuration.load(PPOTraining, run / "config.yaml"), planning=of_run)
@@ -279,8 +283,9 @@ def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path, monkey
         assert ("ppo with planning" in policies) == plans and "ppo" in policies
         if plans:
             assert policies["ppo with planning"].config == (of_run or PlanningConfig())
-    with pytest.raises(ValueError, match="planning: is of the policy of a run, found mppi"):
-        evaluate.Navigation("mppi", planning=True)
+    if planning is not None:
+        with pytest.raises(ValueError, match="planning: is of the policy of a run, found mppi"):
+            evaluate.Navigation("mppi", planning=planning)
 
 
 def test_a_policy_drives_another_vehicle(run, tmp_path, capsys):

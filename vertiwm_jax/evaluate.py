@@ -186,7 +186,7 @@ class Navigation:
             raise ValueError(f"{found[0]}: is of procedural worlds, give it or worlds")
         if self.obstacles and not self.worlds:
             raise ValueError("obstacles: is of given worlds; procedural ones are a suite")
-        if self.planning and not isinstance(self.policy, Path):
+        if self.planning is not None and not isinstance(self.policy, Path):
             raise ValueError(f"planning: is of the policy of a run, found {self.policy}")
         if self.jobs < 1 or (self.jobs > 1 and self.simulator != "chrono"):
             raise ValueError("jobs: expected 1 or more, and 1 in all simulators but Chrono")
@@ -306,9 +306,6 @@ def _navigate(command: Navigation) -> None:
     if run:
         # Checkpoints hold episodes, which know as much of the map as in training.
         own = replace(config, navigation=trained.navigation)
-        if command.planning is not None:
-            planning = own.planning or PlanningConfig()
-            own = replace(own, planning=planning if command.planning else None)
         policies = policy_training.learned(own, terrain, run) | policies
     elif command.policy == "mppi":
         dynamics, weights = task.dynamics(config, command.mppi.model)
@@ -338,7 +335,7 @@ def training(file: Path) -> TrainConfig:
 
 
 def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:
-    """The configuration of a training with the ground that the command asks for."""
+    """The configuration of a training with the test that the command asks for."""
     asked = {name: getattr(command, name) for name in ("suites", "suite_worlds", "pairs")}
     grounds = replace(config.ground, **{name: value for name, value in asked.items() if value})
     if command.worlds:
@@ -348,6 +345,9 @@ def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:
     if command.reveal_range is not None:
         revealed = replace(config.navigation.reveal, range=command.reveal_range)
         config = replace(config, navigation=replace(config.navigation, reveal=revealed))
+    if command.planning is not None:
+        planning = config.planning or PlanningConfig()
+        config = replace(config, planning=planning if command.planning else None)
     if command.suites:
         config = replace(config, worlds=None)
     if command.seed is not None:

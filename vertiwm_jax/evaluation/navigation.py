@@ -165,20 +165,21 @@ def _decide(
     running = state.ending == Ending.RUNNING
     together = min(_TOGETHER * devices.number(), len(running))
     turns = -(-len(running) // together)
+    # Those that drive come first, and the last turn is filled up with one that likely does not.
     filled = np.minimum(np.arange(turns * together), len(running) - 1)
     rows = jnp.argsort(~running)[filled].reshape(turns, together)
     decide = devices.spread(type(driver).decide, (None, None, 0, 0, 0, 0))
 
-    def turn(_: None, rows: jax.Array) -> tuple[None, Any]:
+    def turn(rows: jax.Array) -> Any:
         of_some = jax.tree.map(lambda x: x[rows], (memory, observation, state, keys))
-        return None, jax.lax.cond(
+        return jax.lax.cond(
             jnp.any(running[rows]),
             lambda some: decide(driver, params, *some),
             lambda some: some[0],
             of_some,
         )
 
-    decided = jax.lax.scan(turn, None, rows)[1]
+    decided = jax.lax.map(turn, rows)
     return jax.tree.map(lambda x, y: x.at[rows].set(y, mode="promise_in_bounds"), memory, decided)
 
 
