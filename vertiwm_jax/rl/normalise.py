@@ -32,24 +32,29 @@ class RunningStatistics:
     def update(self, samples: jax.Array) -> Self:
         """Adds `[B..., ...]` samples (any leading axes), by Chan et al. (1979), eq. 2.1."""
         batch = samples.shape[: samples.ndim - self.mean.ndim]
-        if len(batch) > 1:  # in turns: intermediate results of all take long to write
-            return jax.lax.scan(lambda known, x: (known.update(x), None), self, samples)[0]
-        added = math.prod(batch)
+        added, within = math.prod(batch), jnp.float32(0)
+        if len(batch) > 1:
+            # Sample by sample along the first axis, each row of the others by itself: intermediate
+            # results of all take long to write, and devices that share rows need not be waited for.
+            own = RunningStatistics.create(samples.shape[1:])
+            own = jax.lax.scan(lambda known, x: (known.update(x[None]), None), own, samples)[0]
+            batch, samples, within = batch[1:], own.mean, own.variance
 
         def average(x: jax.Array) -> jax.Array:
             # As a product, which a CPU computes several times as fast as sums over first axes.
-            return jnp.tensordot(jnp.ones(batch), x, axes=len(batch), precision="highest") / added
+            total = jnp.tensordot(jnp.ones(batch), x, axes=len(batch), precision="highest")
+            return total / math.prod(batch)
 
         mean = average(samples)
-        variance = average((samples - mean) ** 2)
-        total = self.count + added
-        share = added / total
+        variance = average(within + (samples - mean) ** 2)
+        count = self.count + added
+        share = added / count
         delta = mean - self.mean
         return dataclasses.replace(
             self,
             mean=self.mean + delta * share,
             variance=(1 - share) * self.variance + share * (variance + delta**2 * (1 - share)),
-            count=total,
+            count=count,
         )
 
     @property

@@ -7,6 +7,7 @@ object with two pure functions, `init` and `iterate`, over one `TrainState`; sev
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, cast
 
 import jax
@@ -126,8 +127,9 @@ class Transitions:
 
 @struct.dataclass
 class Batch:
-    """What the loss is made of, `[B]`; `observation` is not normalised, `target` a lambda return.
+    """What the loss is made of, `[T, N]` as collected, or `[B]` of them.
 
+    `observation` is not normalised, `target` a lambda return.
     advantage: in the loss, normalised over its minibatch.
     """
 
@@ -265,7 +267,7 @@ class PPO:
     def _batch(
         self, state: TrainState, returns: RunningStatistics, transitions: Transitions
     ) -> Batch:
-        """Transitions `[T, N]` to the flat batch `[T N]` of the loss."""
+        """Transitions to what the loss is made of, `[T, N]`."""
         experience = transitions.experience
         advantage = generalised_advantages(
             experience.reward / returns.std,
@@ -276,7 +278,7 @@ class PPO:
             self.config.discount,
             self.config.trace,
         )
-        batch = Batch(
+        return Batch(
             observation=experience.observation,
             action=experience.action,
             log_prob=transitions.log_prob,
@@ -284,14 +286,24 @@ class PPO:
             advantage=advantage,
             target=advantage + transitions.value,
         )
-        # Minibatches have rows of all environments.
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), devices.whole(batch))
 
     def _update(
         self, env_params: Params, state: TrainState, batch: Batch, key: jax.Array
     ) -> tuple[Params, optax.OptState, Metrics]:
-        """`epochs` passes of `minibatches` gradient steps; the losses are means over all."""
+        """`epochs` passes of `minibatches` gradient steps; the losses are means over all.
+
+        Minibatches have as many rows of each group of environments, which are `shareable`: devices
+        that share out the groups need none of each other's observations.
+        """
         config = self.config
+        groups = config.shareable
+        batch = jax.tree.map(lambda x: x.reshape(len(x), groups, -1, *x.shape[2:]), batch)
+
+        def chosen(leaf: jax.Array, rows: jax.Array) -> jax.Array:
+            """Of `[T, G, N / G, ...]` the rows `[G, R]` of each group, `[G R, ...]`."""
+            of_group = jax.vmap(lambda x, row: x[*jnp.divmod(row, leaf.shape[2])], in_axes=(1, 0))
+            return devices.share(of_group(leaf, rows).reshape(-1, *leaf.shape[3:]))
+
         actor, optimiser = self._actor(env_params), self._optimiser
 
         def loss(params: Params, batch: Batch) -> tuple[jax.Array, Metrics]:
@@ -321,25 +333,26 @@ class PPO:
                 "clip_fraction": jnp.mean(jnp.abs(ratio - 1) > config.clip),
             }
 
-        def descend(carry: tuple[Params, optax.OptState], rows: jax.Array):
-            params, optimiser_state = carry
-            advantage = devices.share(batch.advantage[rows])
-            mean, deviation = jnp.mean(advantage), jnp.std(advantage)
+        def descend(carry: tuple[Params, optax.OptState], minibatch: tuple[jax.Array, ...]):
+            (params, optimiser_state), (rows, mean, deviation) = carry, minibatch
 
             def of_part(rows: jax.Array) -> tuple[Params, Metrics]:
-                part = devices.share(jax.tree.map(lambda x: x[rows], batch))
+                part = jax.tree.map(lambda leaf: chosen(leaf, rows), batch)
                 part = replace(part, advantage=(part.advantage - mean) / (deviation + 1e-8))
                 return jax.grad(loss, has_aux=True)(params, part)
 
-            parts = rows.reshape(config.accumulate, -1)
-            gradients, losses = mean_in_turns(of_part, parts)
+            gradients, losses = mean_in_turns(of_part, rows)
             updates, optimiser_state = optimiser.update(gradients, optimiser_state, params)
             return (optax.apply_updates(params, updates), optimiser_state), losses
 
-        shuffle = jax.vmap(lambda key: jax.random.permutation(key, config.collected))
-        rows = shuffle(jax.random.split(key, config.epochs))
-        rows = rows.reshape(config.epochs * config.minibatches, -1)
+        shuffle = jax.vmap(lambda key: jax.random.permutation(key, config.collected // groups))
+        rows = shuffle(jax.random.split(key, config.epochs * groups))
+        rows = rows.reshape(config.epochs, groups, config.minibatches, config.accumulate, -1)
+        rows = jnp.moveaxis(rows, 1, 3).reshape(-1, config.accumulate, groups, rows.shape[-1])
+        # Of all minibatches at once, lest devices wait for each other twice more in each.
+        advantage = jax.vmap(jax.vmap(partial(chosen, batch.advantage)))(rows)
+        mean, deviation = jnp.mean(advantage, axis=(1, 2)), jnp.std(advantage, axis=(1, 2))
         (params, optimiser_state), losses = jax.lax.scan(
-            descend, (state.params, state.optimiser), rows
+            descend, (state.params, state.optimiser), (rows, mean, deviation)
         )
         return params, optimiser_state, jax.tree.map(jnp.mean, losses)

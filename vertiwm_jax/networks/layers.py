@@ -1,0 +1,20 @@
+"""Layers that compute as precisely as their weights are stored."""
+
+from functools import partial
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+
+def _as_kernel(inputs: jax.Array, kernel: jax.Array, *bias: Any, dtype: Any) -> tuple[Any, ...]:
+    return inputs.astype(kernel.dtype), kernel, *bias
+
+
+Dense = partial(
+    nn.Dense,
+    promote_dtype=_as_kernel,
+    dot_general=partial(jax.lax.dot_general, preferred_element_type=jnp.float32),
+)
+"""`nn.Dense` whose operands are of its kernel's type, of float32 or bfloat16, and its sums float32."""
