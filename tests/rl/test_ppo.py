@@ -137,6 +137,16 @@ def test_minibatches_must_divide_the_batch():
         PPOConfig(num_envs=4, num_steps=4, minibatches=7)
 
 
+def test_an_epoch_learns_from_every_transition_once():
+    def mean_loss(minibatches):
+        config = PPOConfig(**{**vars(CONFIG), "learning_rate": 0.0, "minibatches": minibatches})
+        return float(train(PPO(Target(), config), iterations=1)[1]["value_loss"])
+
+    # By 16 groups of one environment, then by groups of two and of four.
+    losses = [mean_loss(minibatches) for minibatches in (1, 2, 32, 64)]
+    np.testing.assert_allclose(losses, losses[0], rtol=1e-5)
+
+
 def test_a_minibatch_in_parts_gives_the_gradient_of_the_whole():
     def learned(parts):
         config = PPOConfig(**{**vars(CONFIG), "accumulate": parts, "value_clip": 0.1})
