@@ -8,7 +8,7 @@ nothing, with an observation of the same size. Verti-WM is the one that comes al
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from vertiwm_jax.rl import task
 from vertiwm_jax.rl.loop import Seeds
 from vertiwm_jax.rl.ppo import PPO
 from vertiwm_jax.world_model import model as world_model
-from vertiwm_jax.world_model.choice import ModelName
+from vertiwm_jax.world_model.choice import ModelName, Operands
 
 
 @struct.dataclass
@@ -67,10 +67,11 @@ def iteration(ppo: PPO, params: Any, repeat: int = 1) -> Figures:
     return results
 
 
-def of_task(name: str, model: ModelName, weights: Path | None) -> Figures:
+def of_task(name: str, model: ModelName, weights: Path | None, operands: Operands) -> Figures:
     """An iteration of the training that the configuration `name` describes, inside a model."""
     file = configuration.default_config(name)
-    config = replace(configuration.load(PPOTraining, file), model=model, weights=weights)
+    config = configuration.load(PPOTraining, file)
+    config = replace(config, model=model, weights=weights, operands=operands)
     training, _ = task.training_environment(config)
     return iteration(config.algorithm(training.env), training.params, config.action_repeat)
 
@@ -88,6 +89,7 @@ def main() -> None:
     arguments.add_argument("--configs", nargs="+", default=("ppo", "ppo_paper"))
     arguments.add_argument("--models", nargs="+", default=("builtin", "vertiwm"))
     arguments.add_argument("--size", choices=("base", "paper"), default="base", help="of Verti-WM")
+    arguments.add_argument("--operands", choices=get_args(Operands), default="float32")
     chosen = arguments.parse_args()
     idle = environment.EnvParams(max_steps_in_episode=600)
     results = {"algorithm alone": iteration(PPO(IdleEnv(), PPOTraining().ppo), idle)}
@@ -95,7 +97,7 @@ def main() -> None:
         weights = untrained(Path(folder)) if chosen.size == "paper" else None
         for name in chosen.configs:
             for model in chosen.models:
-                results[f"{name}, {model}"] = of_task(name, model, weights)
+                results[f"{name}, {model}"] = of_task(name, model, weights, chosen.operands)
     report("ppo_throughput", results, chosen.json)
 
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from world_model.examples import commands, driving, one, rough
 
 from vertiwm_jax.dynamics import embedding, rollout
-from vertiwm_jax.world_model.choice import choose, lean
+from vertiwm_jax.world_model.choice import choose, lean, rounded
 from vertiwm_jax.world_model.model import ModelConfig
 from vertiwm_jax.world_model.perception import Exteroception
 from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
@@ -75,3 +76,36 @@ def test_a_lean_model_moves_by_its_commands_but_does_not_learn():
     assert np.any(expected.vector)
     with pytest.raises(TypeError, match="remembers: expected latents to learn"):
         jax.grad(away, argnums=1)(lean(model), params.network, COMMANDS)
+
+
+@pytest.mark.parametrize("name", ["vertiwm", "transformer", "nesam"])
+def test_rounded_operands_are_those_of_the_transformers_alone(name):
+    model, params = choose(name)
+    half = rounded(params, "bfloat16")
+    small = {
+        jax.tree_util.keystr(path)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(half)
+        if leaf.dtype == jnp.bfloat16
+    }
+    # Of each network, four matrices in each of three layers, and what embeds the ground in one.
+    assert len(small) == {"vertiwm": 25, "transformer": 13, "nesam": 12}[name]
+    assert all("network" in leaf and "kernel" in leaf for leaf in small)
+    expected, found = drive(model, params, STATES), drive(model, half, STATES)
+    assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype("float32")}
+    assert not np.array_equal(found.vector, expected.vector)
+    np.testing.assert_allclose(found.position, expected.position, atol=0.01)
+    chex.assert_trees_all_equal(rounded(params, "float32"), params)
+
+
+def test_commands_move_what_has_rounded_operands():
+    """As planners by gradients need it."""
+    model, params = choose("transformer")
+    state = one(STATES, 0)
+
+    def away(commands, params):
+        history = model.init(params, TERRAIN, state)
+        return jnp.sum(rollout(model, params, TERRAIN, history, state, commands).position[-1])
+
+    by_commands = jax.jit(jax.grad(away))
+    expected, found = (by_commands(COMMANDS, p) for p in (params, rounded(params, "bfloat16")))
+    np.testing.assert_allclose(found.vector, expected.vector, atol=0.02)

@@ -10,7 +10,7 @@ import pytest
 from vertiwm_jax.evaluation import prediction
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.world_model.choice import choose
+from vertiwm_jax.world_model.choice import choose, rounded
 from vertiwm_jax.world_model.model import VertiWM
 
 MIXED = Path(__file__).parents[2] / "data" / "open" / "mixed"
@@ -26,9 +26,11 @@ RECORDED = {"rigid": 0.0534, "deformable": 0.0918, "transition": 0.1121}
 """Position errors of Verti-WM after 16 steps, m."""
 
 
-def test_it_predicts_as_it_always_did(windows):
+@pytest.mark.parametrize("operands", ["float32", "bfloat16"])
+def test_it_predicts_as_it_always_did(windows, operands):
     """So that what is changed for speed leaves predictions what they are, to rounding."""
-    errors = prediction.evaluate("it", *choose("vertiwm"), windows)
+    model, params = choose("vertiwm")
+    errors = prediction.evaluate("it", model, rounded(params, operands), windows)
     found = {kind: interval.mean for kind, interval in errors.final["position"].items()}
     assert found == pytest.approx(RECORDED, rel=0.01)
 

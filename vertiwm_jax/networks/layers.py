@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 
 
-def _as_kernel(inputs: jax.Array, kernel: jax.Array, *bias: Any, dtype: Any) -> tuple[Any, ...]:
-    return inputs.astype(kernel.dtype), kernel, *bias
+def _as_kernel(*operands: Any, **_: Any) -> list[Any]:
+    inputs, kernel, bias = operands
+    return [inputs.astype(kernel.dtype), kernel, bias]
 
 
 Dense = partial(
@@ -17,4 +18,4 @@ Dense = partial(
     promote_dtype=_as_kernel,
     dot_general=partial(jax.lax.dot_general, preferred_element_type=jnp.float32),
 )
-"""`nn.Dense` whose operands are of its kernel's type, of float32 or bfloat16, and its sums float32."""
+"""`nn.Dense` whose operands are rounded as its kernel is, to bfloat16 perhaps; sums are float32."""

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vertiwm_jax.networks.layers import Dense
+
 _PERIODS_A_WINDOW = 16
 _MASKED = -1e30  # finite: the softmax of a masked score is 0 and its gradient is no NaN
 
@@ -129,11 +131,11 @@ class _Block(nn.Module):
             self.output_variance, "fan_in", "truncated_normal"
         )
         self.attention_norm = nn.RMSNorm()
-        self.query_key_value = nn.Dense(3 * self.width, use_bias=False)
-        self.attention_output = nn.Dense(self.width, use_bias=False, kernel_init=output)
+        self.query_key_value = Dense(3 * self.width, use_bias=False)
+        self.attention_output = Dense(self.width, use_bias=False, kernel_init=output)
         self.mlp_norm = nn.RMSNorm()
-        self.mlp_hidden = nn.Dense(self.hidden)
-        self.mlp_output = nn.Dense(self.width, kernel_init=output)
+        self.mlp_hidden = Dense(self.hidden)
+        self.mlp_output = Dense(self.width, kernel_init=output)
 
     def __call__(
         self, tokens: jax.Array, turn: tuple[jax.Array, jax.Array], visible: jax.Array

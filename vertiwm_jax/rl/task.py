@@ -20,7 +20,15 @@ from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
 from vertiwm_jax.rl import ground
 from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.choice import Imagined, ModelName, choose, lean, sighted
+from vertiwm_jax.world_model.choice import (
+    Imagined,
+    ModelName,
+    Operands,
+    choose,
+    lean,
+    rounded,
+    sighted,
+)
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,9 @@ class TaskConfig:
     """What moves the vehicle while learning; tests after it are in the built-in simulator."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
+    operands: Operands = "float32"
+    """What learned models multiply; bfloat16 is faster on CPUs with AVX512_BF16 or AMX, and moves
+    where vehicles get to by less than a model errs."""
     simulator: Simulator = Simulator()
     """The built-in simulator."""
 
@@ -130,7 +141,8 @@ def dynamics(config: TaskConfig, model: Imagined) -> tuple[Dynamics, Params]:
     if model == "builtin":
         chosen = config.simulator, chrono_like(config.driven.vehicle)
     else:
-        chosen = choose(model, config.weights, vehicle=config.driven.vehicle)
+        moves, params = choose(model, config.weights, vehicle=config.driven.vehicle)
+        chosen = moves, rounded(params, config.operands)
     if config.navigation.embeddings:
         return sighted(model, *chosen, config.weights)
     return lean(chosen[0]), chosen[1]

@@ -1,8 +1,12 @@
 """Every model of this package by name, for commands that let their users choose."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
+
+import jax
+from jax.tree_util import DictKey
 
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, Params
@@ -16,11 +20,14 @@ from vertiwm_jax.world_model.perception import Eyes, Sighted, SightedParams
 from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
 
 D = TypeVar("D", bound=Dynamics)
+P = TypeVar("P")
 
 ModelName = Literal["builtin", "transformer", "nesam", "vertiwm"]
 """The simulator, which has learned nothing; either specialist; both of them fused."""
 Imagined = Literal["bicycle", "builtin", "transformer", "nesam", "vertiwm"]
 """What a planner may imagine in: those, and a kinematic bicycle, which knows no forces."""
+Operands = Literal["float32", "bfloat16"]
+"""What the weights of specialists, and what they are multiplied by, are rounded to."""
 
 
 def choose(
@@ -92,6 +99,21 @@ def lean(dynamics: D) -> D:
     if isinstance(dynamics, VertiWM) and dynamics.can_be_lean:
         return replace(dynamics, transformer=lean(dynamics.transformer))
     return dynamics
+
+
+def rounded(params: P, operands: Operands) -> P:
+    """Parameters whose specialists multiply the weights of their Transformers as `operands`.
+
+    Encoders, gates, physics, poses and all sums stay float32. In bfloat16 a step is faster where
+    the processor multiplies it (AVX512_BF16, AMX), and slower elsewhere (docs/performance.md).
+    """
+
+    def one(path: Sequence[Any], leaf: jax.Array) -> jax.Array:
+        names = [key.key for key in path if isinstance(key, DictKey)]
+        large = names[-1:] == ["kernel"] and {"transformer", "embed_ground"} & set(names)
+        return leaf.astype(operands) if large else leaf
+
+    return jax.tree.map_with_path(one, params)
 
 
 def fitted(

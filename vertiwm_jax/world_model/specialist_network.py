@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 
 from vertiwm_jax.networks.encoder import LATENT_CHANNELS
+from vertiwm_jax.networks.layers import Dense
 from vertiwm_jax.networks.transformer import KeyValueCache, Transformer
 from vertiwm_jax.world_model.perception import Glance, Perception
 from vertiwm_jax.world_model.sizes import TransformerSize
@@ -25,7 +26,7 @@ class SpecialistNetwork(nn.Module):
         size = self.size
         self.embed = nn.Dense(size.width)
         self.reduce = Reduction(size.channels)
-        self.embed_ground = nn.Dense(size.width, use_bias=False)
+        self.embed_ground = Dense(size.width, use_bias=False)
         self.transformer = Transformer(size.layers, size.width, size.heads, size.hidden, WINDOW)
         # Untrained, it changes nothing: the mean transition stays, or physics.
         self.head = nn.Dense(12, kernel_init=nn.initializers.zeros)
