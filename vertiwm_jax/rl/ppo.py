@@ -345,10 +345,7 @@ class PPO:
             updates, optimiser_state = optimiser.update(gradients, optimiser_state, params)
             return (optax.apply_updates(params, updates), optimiser_state), losses
 
-        shuffle = jax.vmap(lambda key: jax.random.permutation(key, config.collected // groups))
-        rows = shuffle(jax.random.split(key, config.epochs * groups))
-        rows = rows.reshape(config.epochs, groups, config.minibatches, config.accumulate, -1)
-        rows = jnp.moveaxis(rows, 1, 3).reshape(-1, config.accumulate, groups, rows.shape[-1])
+        rows = self._minibatches(key)
         # Of all minibatches at once, lest devices wait for each other twice more in each.
         advantage = jax.vmap(jax.vmap(partial(chosen, batch.advantage)))(rows)
         mean, deviation = jnp.mean(advantage, axis=(1, 2)), jnp.std(advantage, axis=(1, 2))
@@ -356,3 +353,11 @@ class PPO:
             descend, (state.params, state.optimiser), (rows, mean, deviation)
         )
         return params, optimiser_state, jax.tree.map(jnp.mean, losses)
+
+    def _minibatches(self, key: jax.Array) -> jax.Array:
+        """`[epochs * minibatches, accumulate, G, R]` rows of each group, all once an epoch."""
+        config, groups = self.config, self.config.shareable
+        shuffle = jax.vmap(lambda key: jax.random.permutation(key, config.collected // groups))
+        rows = shuffle(jax.random.split(key, config.epochs * groups))
+        rows = rows.reshape(config.epochs, groups, config.minibatches, config.accumulate, -1)
+        return jnp.moveaxis(rows, 1, 3).reshape(-1, config.accumulate, groups, rows.shape[-1])

@@ -53,8 +53,8 @@ class TaskConfig:
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
     operands: Operands = "float32"
-    """What learned models multiply; bfloat16 is faster on CPUs with AVX512_BF16 or AMX, and moves
-    where vehicles get to by less than a model errs."""
+    """What learned models multiply; bfloat16 is faster on CPUs with AVX512_BF16, slower on others,
+    and leaves errors of prediction what they are to 1 %."""
     simulator: Simulator = Simulator()
     """The built-in simulator."""
 

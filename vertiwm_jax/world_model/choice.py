@@ -105,7 +105,7 @@ def rounded(params: P, operands: Operands) -> P:
     """Parameters whose specialists multiply the weights of their Transformers as `operands`.
 
     Encoders, gates, physics, poses and all sums stay float32. In bfloat16 a step is faster where
-    the processor multiplies it (AVX512_BF16, AMX), and slower elsewhere (docs/performance.md).
+    the processor multiplies it (AVX512_BF16), and slower elsewhere (docs/performance.md).
     """
 
     def one(path: Sequence[Any], leaf: jax.Array) -> jax.Array:
