@@ -89,7 +89,9 @@ def main() -> None:
     arguments.add_argument("--configs", nargs="+", default=("ppo", "ppo_paper"))
     arguments.add_argument("--models", nargs="+", default=("builtin", "vertiwm"))
     arguments.add_argument("--size", choices=("base", "paper"), default="base", help="of Verti-WM")
-    arguments.add_argument("--operands", choices=get_args(Operands), default="float32")
+    arguments.add_argument(
+        "--operands", nargs="+", choices=get_args(Operands), default=("float32",), help="of models"
+    )
     chosen = arguments.parse_args()
     idle = environment.EnvParams(max_steps_in_episode=600)
     results = {"algorithm alone": iteration(PPO(IdleEnv(), PPOTraining().ppo), idle)}
@@ -97,7 +99,9 @@ def main() -> None:
         weights = untrained(Path(folder)) if chosen.size == "paper" else None
         for name in chosen.configs:
             for model in chosen.models:
-                results[f"{name}, {model}"] = of_task(name, model, weights, chosen.operands)
+                for operands in chosen.operands:
+                    row = of_task(name, model, weights, operands)
+                    results[f"{name}, {model}, {operands}"] = row
     report("ppo_throughput", results, chosen.json)
 
 

@@ -6,7 +6,8 @@ in place and time and again, for new memory comes several times slower.
 """
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 from benchmarks._harness import Figures, measure, parser, report
 from benchmarks.models import drives
 from vertiwm_jax.world_model import fusion
-from vertiwm_jax.world_model.choice import lean
+from vertiwm_jax.world_model.choice import Operands, lean
 from vertiwm_jax.world_model.fusion import Proposal
 from vertiwm_jax.world_model.model import VertiWM
 
@@ -87,13 +88,18 @@ def parts(batch: int) -> dict[str, Part]:
 
 
 def ceilings() -> dict[str, float]:
-    """FLOP/s of a matmul and bytes/s of a sum of large arrays, on this machine, now."""
-    a, b = jax.random.normal(jax.random.key(0), (2, 1024, 1024))
-    matmul = measure(jax.jit(jnp.matmul), a, b)
+    """FLOP/s of matmuls and bytes/s of a sum of large arrays, on this machine, now."""
+    ab = jax.random.normal(jax.random.key(0), (2, 1024, 1024))
+    matmul = jax.jit(partial(jnp.matmul, preferred_element_type=jnp.float32))
+    single, half = (measure(matmul, *ab.astype(operands)) for operands in get_args(Operands))
     x, y = jnp.ones((2, 1 << 24))
     sums = jax.jit(lambda x, y: jax.lax.fori_loop(0, _SUMS, lambda _, x: x + y, x))
     moved = 3 * _SUMS * x.nbytes
-    return {"flops": 2 * 1024**3 / matmul["min_s"], "bytes": moved / measure(sums, x, y)["min_s"]}
+    return {
+        "flops": 2 * 1024**3 / single["min_s"],
+        "flops_of_bfloat16": 2 * 1024**3 / half["min_s"],
+        "bytes": moved / measure(sums, x, y)["min_s"],
+    }
 
 
 def cost(part: Part, batch: int) -> tuple[float, float]:
@@ -115,7 +121,11 @@ def figures(batch: int) -> dict[str, Figures]:
     times = {name: measure(over_vehicles(part), *part[1]) for name, part in chosen.items()}
     whole = times["the whole step"]["median_s"]
     rows: dict[str, Figures] = {
-        "ceilings": {"GFLOP/s": limits["flops"] / 1e9, "GB/s": limits["bytes"] / 1e9}
+        "ceilings": {
+            "GFLOP/s": limits["flops"] / 1e9,
+            "GFLOP/s of bfloat16": limits["flops_of_bfloat16"] / 1e9,
+            "GB/s": limits["bytes"] / 1e9,
+        }
     }
     for name, part in chosen.items():
         flops, size = cost(part, batch)

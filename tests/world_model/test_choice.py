@@ -60,22 +60,24 @@ def test_what_needs_latents_is_refused():
         embedding(jax.eval_shape(lean(model).init, params, TERRAIN, one(STATES, 0)))
 
 
+def away(model, params, network, commands):
+    params, state = replace(params, network=network), one(STATES, 0)
+    history = model.init(params, TERRAIN, state)
+    return jnp.sum(rollout(model, params, TERRAIN, history, state, commands).position[-1])
+
+
+by_commands = jax.jit(jax.grad(away, argnums=3), static_argnums=0)
+
+
 def test_a_lean_model_moves_by_its_commands_but_does_not_learn():
     model, params = choose("transformer")
-    state = one(STATES, 0)
-
-    def away(model, network, commands):
-        given = replace(params, network=network)
-        history = model.init(given, TERRAIN, state)
-        end = rollout(model, given, TERRAIN, history, state, commands)
-        return jnp.sum(end.position[-1])
-
-    by_commands = jax.jit(jax.grad(away, argnums=2), static_argnums=0)
-    expected, found = (by_commands(m, params.network, COMMANDS) for m in (model, lean(model)))
+    expected, found = (
+        by_commands(m, params, params.network, COMMANDS) for m in (model, lean(model))
+    )
     np.testing.assert_allclose(found.vector, expected.vector, atol=1e-4)
     assert np.any(expected.vector)
     with pytest.raises(TypeError, match="remembers: expected latents to learn"):
-        jax.grad(away, argnums=1)(lean(model), params.network, COMMANDS)
+        jax.grad(away, argnums=2)(lean(model), params, params.network, COMMANDS)
 
 
 @pytest.mark.parametrize("name", ["vertiwm", "transformer", "nesam"])
@@ -100,12 +102,8 @@ def test_rounded_operands_are_those_of_the_transformers_alone(name):
 def test_commands_move_what_has_rounded_operands():
     """As planners by gradients need it."""
     model, params = choose("transformer")
-    state = one(STATES, 0)
-
-    def away(commands, params):
-        history = model.init(params, TERRAIN, state)
-        return jnp.sum(rollout(model, params, TERRAIN, history, state, commands).position[-1])
-
-    by_commands = jax.jit(jax.grad(away))
-    expected, found = (by_commands(COMMANDS, p) for p in (params, rounded(params, "bfloat16")))
-    np.testing.assert_allclose(found.vector, expected.vector, atol=0.02)
+    expected, found = (
+        by_commands(model, p, p.network, COMMANDS) for p in (params, rounded(params, "bfloat16"))
+    )
+    apart = np.linalg.norm(found.vector - expected.vector)
+    assert 0 < apart < 0.05 * np.linalg.norm(expected.vector)

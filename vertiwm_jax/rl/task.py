@@ -139,13 +139,13 @@ def environment(
 def dynamics(config: TaskConfig, model: Imagined) -> tuple[Dynamics, Params]:
     """One of the models, and its parameters."""
     if model == "builtin":
-        chosen = config.simulator, chrono_like(config.driven.vehicle)
+        moves, params = config.simulator, chrono_like(config.driven.vehicle)
     else:
         moves, params = choose(model, config.weights, vehicle=config.driven.vehicle)
-        chosen = moves, rounded(params, config.operands)
+        params = rounded(params, config.operands)
     if config.navigation.embeddings:
-        return sighted(model, *chosen, config.weights)
-    return lean(chosen[0]), chosen[1]
+        return sighted(model, moves, params, config.weights)
+    return lean(moves), params
 
 
 def outcomes(info: dict[str, jax.Array]) -> dict[str, jax.Array]:
