@@ -6,7 +6,7 @@ import sys
 import pytest
 from doors import opened, refusal
 
-from vertiwm_jax import compare, runs
+from vertiwm_jax import compare, devices, runs
 from vertiwm_jax import config as configuration
 from vertiwm_jax.compare import CompareConfig, Row
 
@@ -25,7 +25,7 @@ suite_worlds: 1
 
 
 @pytest.mark.slow
-def test_policies_are_trained_once_and_judged_together(tmp_path):
+def test_policies_are_trained_once_and_judged_together(tmp_path, monkeypatch):
     (tmp_path / "ppo.yaml").write_text(SHARED + PPO)
     (tmp_path / "table.yaml").write_text(TABLE)
     first = ["--config", str(tmp_path / "table.yaml"), "--settings", str(tmp_path)]
@@ -39,12 +39,15 @@ def test_policies_are_trained_once_and_judged_together(tmp_path):
         assert (run / "builtin" / "episodes.csv").read_text().count("straight to goal") == 10
         # Stopped before its test: it is not trained again, but tested.
         (nesam,) = run.glob("ppo_in_nesam/ppo-*")
-        before = runs.read_metrics(nesam)
+        before, kept = runs.read_metrics(nesam), (nesam / "config.yaml").read_text()
+        faster = devices.multiplies_bfloat16()
+        monkeypatch.setattr(devices, "multiplies_bfloat16", lambda: not faster)
         (nesam / "summary.json").unlink()
         shutil.rmtree(run / "builtin")
         table("--resume", str(run))
     assert [*run.glob("ppo_in_*/ppo-*")] == trainings
     assert runs.read_metrics(nesam) == before
+    assert (nesam / "config.yaml").read_text() == kept
     assert (nesam / "summary.json").is_file()
     assert (run / "table.md").read_text() == text
 

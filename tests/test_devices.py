@@ -56,6 +56,17 @@ def test_a_spread_function_gives_what_vmap_gives(two, size, at_a_time):
     chex.assert_trees_all_close(devices_of(two, spread, 2.0, x, y), expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("half", "faster"), [(0.55, True), (0.9, False), (1.6, False)])
+def test_bfloat16_has_to_be_clearly_faster(half, faster, monkeypatch):
+    monkeypatch.setattr(devices, "_seconds_of_matmul", lambda *_: [1.0, half])
+    assert devices.multiplies_bfloat16.__wrapped__() is faster
+
+
+def test_matmuls_are_timed_by_type():
+    seconds = devices._seconds_of_matmul(jnp.float32, jnp.bfloat16)
+    assert len(seconds) == 2 and all(0 < one < 1 for one in seconds)
+
+
 def test_each_device_has_its_share_of_the_rows(two):
     with jax.set_mesh(two):
         program = jax.jit(devices.spread(jnp.sin, (0,), 4)).lower(jnp.zeros(64))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from doors import opened, refusal
 
-from vertiwm_jax import checkpoints, evaluate, export, policy_training, ppo, runs, sac, td3
+from vertiwm_jax import checkpoints, devices, evaluate, export, policy_training, ppo, runs, sac, td3
 from vertiwm_jax import config as configuration
 from vertiwm_jax.deploy import run_policy
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
@@ -299,13 +299,19 @@ def test_a_policy_drives_another_vehicle(run, tmp_path, capsys):
     assert "did you mean 'rover'" in message
 
 
-def test_training_inside_a_world_model_and_judged_in_the_simulator(train, tmp_path, capsys):
+def test_training_inside_a_world_model_and_judged_in_the_simulator(
+    train, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(devices, "multiplies_bfloat16", lambda: True)
     config = ModelConfig()
     params = config.init_params(jax.random.key(0), choose("builtin")[1])
     model.save(tmp_path / "model", config, params)
     varied = ["--variation.grip", "0.6", "1.0", "--variation.delay", "0", "2"]
     run = train("--model", "vertiwm", "--weights", str(tmp_path / "model"), *varied)
-    assert "training in vertiwm on 2 worlds" in capsys.readouterr().out
+    expected = "training in vertiwm on 2 worlds, multiplying bfloat16"
+    assert expected in capsys.readouterr().out
+    # It goes on with what it began with, wherever that is.
+    assert configuration.load(PPOTraining, run / "config.yaml").operands == "bfloat16"
     assert all(np.isfinite(line["policy_loss"]) for line in runs.read_metrics(run))
     evaluate.main(["navigation", "--policy", str(run)])
     assert (run / "summary.md").read_text() in capsys.readouterr().out

@@ -124,6 +124,9 @@ def _train(row: Row, settings: TrainConfig, folder: Path) -> Path:
     if begun and (begun / "summary.json").is_file():
         print(f"trained in {begun}", flush=True)
         return begun
+    if begun:
+        kept = configuration.load(type(settings), begun / "config.yaml")
+        settings = replace(settings, operands=kept.operands)
     return policy_training.train_and_report(replace(settings, runs=place, resume=begun))
 
 

@@ -4,7 +4,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -148,6 +148,7 @@ def _policies(
 def train_and_report(config: TrainConfig) -> Path:
     """Trains, or goes on with, a policy, tests it, and gives the folder of the run."""
     keep_compiled(config.compile_cache)
+    config = replace(config, operands=config.multiplied)  # So that it goes on as it began.
     print("drawing worlds ...", flush=True)
     with _on_usable_ground():
         terrain, pool, held_out = task.training_ground(config)
@@ -167,7 +168,8 @@ def train_and_report(config: TrainConfig) -> Path:
     devices.forget_programs()
     with Run.begin(config, config.name, restored[0] if restored else 0, config.wandb) as run:
         print(f"run folder {run.folder}", flush=True)
-        print(f"training in {config.model} on {terrain.worlds} worlds", flush=True)
+        products = "" if config.model == "builtin" else f", multiplying {config.operands}"
+        print(f"training in {config.model} on {terrain.worlds} worlds{products}", flush=True)
         key = config.key("training")
         state = train(
             algorithm,

@@ -1,10 +1,11 @@
 """What is driven, where: another vehicle brings its shape, and its ground."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vertiwm_jax import config
+from vertiwm_jax import config, devices
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.episode import NavigationConfig
@@ -39,6 +40,24 @@ def test_a_rover_is_tested_on_soil_of_its_scale():
     assert np.isfinite(test.params.starts.vehicle.vector).all()
     found = test.params.dynamics.vehicle
     jax.tree.map(np.testing.assert_array_equal, found, vehicle.load("rover").vehicle)
+
+
+@pytest.mark.parametrize(
+    ("asked", "faster", "found"),
+    [
+        ("auto", True, "bfloat16"),
+        ("auto", False, "float32"),
+        ("bfloat16", False, "bfloat16"),
+        ("float32", True, "float32"),
+    ],
+)
+def test_models_multiply_what_is_asked_or_faster(asked, faster, found, monkeypatch):
+    monkeypatch.setattr(devices, "multiplies_bfloat16", lambda: faster)
+    chosen = TaskConfig(operands=asked)
+    assert chosen.multiplied == found
+    _, params = task.dynamics(chosen, "nesam")
+    half = any(leaf.dtype == jnp.bfloat16 for leaf in jax.tree.leaves(params))
+    assert half == (found == "bfloat16")
 
 
 def test_a_vehicle_that_is_none_is_named(tmp_path):

@@ -6,6 +6,7 @@ from typing import Literal
 
 import jax
 
+from vertiwm_jax import devices
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import tasks
 from vertiwm_jax.env.chassis import Chassis
@@ -52,14 +53,22 @@ class TaskConfig:
     """What moves the vehicle while learning; tests after it are in the built-in simulator."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
-    operands: Operands = "float32"
+    operands: Operands | Literal["auto"] = "auto"
     """What learned models multiply; bfloat16 is faster on CPUs with AVX512_BF16, slower on others,
-    and leaves errors of prediction what they are to 1 %."""
+    and leaves errors of prediction what they are to 1 %. A training that begins with auto tries
+    which it is, and keeps to it."""
     simulator: Simulator = Simulator()
     """The built-in simulator."""
 
     def __post_init__(self):
         vehicle.load(self.vehicle)  # That it cannot be read is to be said now.
+
+    @property
+    def multiplied(self) -> Operands:
+        """`operands`, or which of them are faster here."""
+        if self.operands == "auto":
+            return "bfloat16" if devices.multiplies_bfloat16() else "float32"
+        return self.operands
 
     @property
     def driven(self) -> VehicleConfig:
@@ -142,7 +151,7 @@ def dynamics(config: TaskConfig, model: Imagined) -> tuple[Dynamics, Params]:
         moves, params = config.simulator, chrono_like(config.driven.vehicle)
     else:
         moves, params = choose(model, config.weights, vehicle=config.driven.vehicle)
-        params = rounded(params, config.operands)
+        params = rounded(params, config.multiplied)
     if config.navigation.embeddings:
         return sighted(model, moves, params, config.weights)
     return lean(moves), params
