@@ -21,6 +21,7 @@ from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.world_model import model
 from vertiwm_jax.world_model.choice import choose, sighted
 from vertiwm_jax.world_model.model import ModelConfig, VertiWM
+from vertiwm_jax.world_model.perception import Sighted
 
 CONFIG = NavigationConfig(speed_range=(0.0, 5.0), settle_steps=1, embeddings=True)
 BLIND = NavigationConfig(speed_range=(0.0, 5.0), settle_steps=1)
@@ -89,7 +90,8 @@ def test_own_encoders_are_not_taken_for_the_transformers(tmp_path):
     assert dynamics.dynamics == chosen[0] and found.dynamics is chosen[1]
     for name, kept in (("vertiwm", True), ("transformer", True), ("builtin", False)):
         moves = choose(name, tmp_path)
-        assert (sighted(name, *moves, tmp_path)[0] is moves[0]) == kept
+        found, _ = sighted(name, *moves, tmp_path)
+        assert isinstance(found, Sighted) != kept
     model.save(tmp_path / "soil", replace(config, parts=("nesam",)), params)
     with pytest.raises(CheckpointError, match="soil: expected the encoders of a Transformer"):
         sighted("nesam", *choose("nesam", tmp_path / "soil"), tmp_path / "soil")

@@ -28,26 +28,42 @@ def drive(model, params, states):
     return jax.vmap(of_one)(states)
 
 
-@pytest.mark.parametrize("name", ["vertiwm", "transformer"])
-def test_a_lean_model_drives_alike(name):
-    model, params = choose(name)
+def drives_alike(model, params):
     assert lean(model) != model and lean(lean(model)) == lean(model)
     expected, found = (drive(m, params, STATES) for m in (model, lean(model)))
     np.testing.assert_allclose(found.vector, expected.vector, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["builtin", "nesam", "bicycle"])
+@pytest.mark.parametrize("name", ["vertiwm", "transformer", "nesam"])
+def test_a_lean_model_drives_alike(name):
+    drives_alike(*choose(name))
+
+
+def filled(leaf):
+    return leaf if leaf.any() else jax.random.normal(jax.random.key(1), leaf.shape) / 50
+
+
+@pytest.mark.parametrize("soil", ["map", "predicted"])
+def test_so_does_one_whose_specialists_have_encoders_of_their_own(soil):
+    config = ModelConfig(soil=soil)
+    untrained = config.init_params(jax.random.key(0), choose("builtin")[1])
+    # Where nothing is learned yet, the ground is not read at all.
+    drives_alike(config.build(), jax.tree.map(filled, untrained))
+
+
+@pytest.mark.parametrize("name", ["builtin", "bicycle"])
 def test_models_without_latents_are_lean_already(name):
     model, _ = choose(name)
     assert lean(model) == model
 
 
-def test_nesam_needs_latents_for_its_own_encoders_or_for_soils():
-    own, predicted = ModelConfig(), ModelConfig(encoders="shared", soil="predicted")
-    for config in (own, predicted):
-        assert lean(config.build()) == config.build()
-        with pytest.raises(ValueError, match="remembers: expected latents"):
-            replace(config.build(), transformer=lean(config.transformer))
+def test_nesam_needs_latents_for_soils():
+    config = ModelConfig(encoders="shared", soil="predicted")
+    assert lean(config.build()) == config.build()
+    with pytest.raises(ValueError, match="remembers: expected latents"):
+        replace(config.build(), transformer=lean(config.transformer))
+    with pytest.raises(ValueError, match="remembers: expected latents to predict soils"):
+        replace(config.nesam, remembers="glance")
 
 
 def test_what_needs_latents_is_refused():

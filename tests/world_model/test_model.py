@@ -26,7 +26,7 @@ from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.terrain.crop import PatchConfig
 from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.model import ModelConfig, VertiWM
-from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception
+from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception, View
 from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
 
 TERRAIN, TAUGHT = rough(), Exteroception(PatchConfig())
@@ -60,7 +60,10 @@ class SeeingBicycle:
         return state, replace(history, perception=self.look(params, terrain, state))
 
     def look(self, params, terrain, state):
-        return self.exteroception.look((params.encoders,), terrain, state)[0]
+        return self.exteroception.look((self.view(params),), terrain, state)[0]
+
+    def view(self, params):
+        return View(params.encoders)
 
     def propose(self, params, terrain, history, state, command):
         arguments = (params.physics, terrain, history.physics, state, command)

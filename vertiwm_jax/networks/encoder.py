@@ -7,6 +7,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
 from vertiwm_jax.state import CELL_PIXELS
 
@@ -31,20 +32,69 @@ class TerrainEncoder(nn.Module):
         self.cell_bias = self.param("cell_bias", nn.initializers.zeros, (LATENT_CHANNELS,))
         self.Conv_0 = _Halving(24)
         self.Conv_1 = nn.Conv(23, (3, 3))
-        self.expand = nn.Dense(4 * LATENT_CHANNELS, kernel_init=nn.initializers.zeros)
+        self.expand = _Linear(23, 4 * LATENT_CHANNELS)
 
     def __call__(self, patch: jax.Array) -> jax.Array:
         """`[..., 128, 128, channels]` in about [-1, 1] to `[..., 16, 16, 18]`."""
         assert patch.shape[-1] == self.channels, patch.shape
         projected = _cells(patch) @ self.cell_kernel.reshape(-1, LATENT_CHANNELS)
         fours = _space_to_depth(projected, 2)
-        return in_rows(self.of_fours(fours.reshape(*fours.shape[:-1], 4, LATENT_CHANNELS)))
+        return in_rows(self.of_fours(fours.reshape(*fours.shape[:-1], 4, LATENT_CHANNELS)).latent)
 
-    def of_fours(self, projected: jax.Array) -> jax.Array:
+    def of_fours(self, projected: jax.Array) -> "Fours":
         """The same of what `cell_kernel` makes of each cell, four by four: `[..., 8, 8, 4, 18]`."""
         fours = projected.reshape(*projected.shape[:-2], -1) + jnp.tile(self.cell_bias, 4)
         coarse = nn.silu(self.Conv_1(nn.silu(self.Conv_0(fours))))
-        return (fours + self.expand(coarse)).reshape(projected.shape)
+        return Fours(fours, coarse, self.expand.kernel, self.expand.bias)
+
+
+@struct.dataclass
+class Fours:
+    """A latent of four cells by four, whose sum need not be made to know what is linear in it.
+
+    fine: `[..., 8, 8, 4 * 18]` one addend; the other is `coarse` `[..., 8, 8, I]`, a number of
+        features, times `kernel` `[I, 4 * 18]`, and `bias` `[4 * 18]`.
+    """
+
+    fine: jax.Array
+    coarse: jax.Array
+    kernel: jax.Array
+    bias: jax.Array
+
+    @property
+    def latent(self) -> jax.Array:
+        """`[..., 8, 8, 4, 18]`."""
+        return _of_each(self.fine + (self.coarse @ self.kernel + self.bias))
+
+    @property
+    def mean(self) -> jax.Array:
+        """`[..., 18]` over all cells."""
+        fine, coarse = (jnp.mean(x, axis=(-3, -2)) for x in (self.fine, self.coarse))
+        return jnp.mean(_of_each(fine + coarse @ self.kernel + self.bias), axis=-2)
+
+    def times(self, matrix: jax.Array) -> jax.Array:
+        """The latent times `[18, C]`, `[..., 8, 8, 4, C]`."""
+        kernel, bias = _of_each(self.kernel) @ matrix, _of_each(self.bias) @ matrix
+        added = self.coarse @ kernel.reshape(len(kernel), -1)
+        of_fine = _of_each(self.fine) @ matrix
+        return of_fine + added.reshape(of_fine.shape) + bias
+
+
+def _of_each(fours: jax.Array) -> jax.Array:
+    """`[..., 4 * 18]` to `[..., 4, 18]`."""
+    return fours.reshape(*fours.shape[:-1], 4, LATENT_CHANNELS)
+
+
+class _Linear(nn.Module):
+    """The weights of a `nn.Dense`."""
+
+    inputs: int
+    outputs: int
+
+    def setup(self) -> None:
+        zeros = nn.initializers.zeros
+        self.kernel = self.param("kernel", zeros, (self.inputs, self.outputs))
+        self.bias = self.param("bias", zeros, (self.outputs,))
 
 
 class _Halving(nn.Module):

@@ -105,17 +105,17 @@ class Senses:
     candidates: Candidates | None = None
     image: tuple[int, int, int] | None = None
 
-    def read(self, observation: jax.Array) -> jax.Array:
-        """The observation `[..., O]` with its picture compressed: `[..., O - h w c + 16]`.
+    def read(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The observation `[..., O]` without its picture, and that compressed, `[..., 16]` or none.
 
         Part of a module's compact method.
         """
         if self.image is None:
-            return observation
+            return observation, observation[..., :0]
         h, w, c = self.image
         rest, seen = observation[..., : -h * w * c], observation[..., -h * w * c :]
         seen = seen.reshape(*seen.shape[:-1], h * w // _TILE**2, _TILE**2 * c)
-        return jnp.concatenate([rest, Compressor()(seen)], axis=-1)
+        return rest, Compressor()(seen)
 
 
 def tiles(picture: jax.Array) -> jax.Array:
@@ -150,9 +150,15 @@ class Attention(nn.Module):
     candidates: Candidates
 
     @nn.compact
-    def __call__(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """`[..., O]` to features `[..., 2 H + R]` and the mean `[..., A]` of attended actions."""
+    def __call__(
+        self, observation: jax.Array, compressed: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """`[..., O]` to features `[..., 2 H + R]` and the mean `[..., A]` of attended actions.
+
+        compressed: what else is told, of which all the rest `R` then has more.
+        """
         seen, rest = self.candidates.split(observation)
+        rest = jnp.concatenate([rest, compressed], axis=-1)
         kernel_init = nn.initializers.orthogonal(math.sqrt(2))
         first, *more = self.hidden
         context = nn.Dense(first, use_bias=False, kernel_init=kernel_init)(rest)
@@ -267,8 +273,9 @@ def _look(
 
     Part of a module's compact method.
     """
-    observation = senses.read(observation)
+    observation, compressed = senses.read(observation)
     if senses.candidates is None:
-        return observation, 0.0, hidden
-    features, attended = Attention(hidden, senses.candidates)(observation)
+        return jnp.concatenate([observation, compressed], axis=-1), 0.0, hidden
+    # Apart: what is learned is learned from the one alone, and the other needs no gradient.
+    features, attended = Attention(hidden, senses.candidates)(observation, compressed)
     return features, attended, hidden[-1:]

@@ -65,6 +65,8 @@ def sighted(
     config, seen_by = _eyes(weights)
     seeing = {"vertiwm", "transformer"} | ({"nesam"} if config.encoders == "shared" else set())
     if name in seeing:
+        if isinstance(dynamics, VertiWM):
+            dynamics = replace(dynamics, nesam=lean(dynamics.nesam))
         return dynamics, params
     return Sighted(dynamics), SightedParams(params, seen_by)
 
@@ -96,8 +98,11 @@ def lean(dynamics: D) -> D:
     """
     if isinstance(dynamics, TransformerSpecialist) and dynamics.terrain == "patches":
         return replace(dynamics, remembers="glance")
-    if isinstance(dynamics, VertiWM) and dynamics.can_be_lean:
-        return replace(dynamics, transformer=lean(dynamics.transformer))
+    if isinstance(dynamics, Nesam) and dynamics.soil == "map":
+        return replace(dynamics, remembers="glance")
+    if isinstance(dynamics, VertiWM):
+        transformer = dynamics.transformer if dynamics.looks_at_both else lean(dynamics.transformer)
+        return replace(dynamics, transformer=transformer, nesam=lean(dynamics.nesam))
     return dynamics
 
 

@@ -20,7 +20,7 @@ from vertiwm_jax.world_model import fusion
 from vertiwm_jax.world_model.fusion import CONTEXT_SIZE, POSITION_AND_YAW, GateTerrain, Proposal
 from vertiwm_jax.world_model.nesam import Nesam, SoilSource
 from vertiwm_jax.world_model.normalisation import Normalisation
-from vertiwm_jax.world_model.perception import Perception, Specialist
+from vertiwm_jax.world_model.perception import Glance, Perception, Specialist
 from vertiwm_jax.world_model.sizes import BASE, PAPER
 from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
 
@@ -92,7 +92,7 @@ class VertiWMHistory:
     spread: jax.Array
 
     @property
-    def perception(self) -> Perception:
+    def perception(self) -> Perception | Glance:
         """The Transformer's, as one of the two that see the current state."""
         return self.transformer.perception
 
@@ -189,16 +189,16 @@ class VertiWM:
     coefficients: Literal["grouped", "scalar"] = "grouped"
 
     def __post_init__(self) -> None:
-        if getattr(self.transformer, "remembers", "latents") == "glance" and not self.can_be_lean:
+        if getattr(self.transformer, "remembers", "latents") == "glance" and self.looks_at_both:
             raise ValueError(
-                "transformer.remembers: expected latents, which NeSAM looks at too unless it "
-                "shares encoders and has soils from the map, found glance"
+                "transformer.remembers: expected latents, of which NeSAM, which shares encoders, "
+                "predicts soils, found glance"
             )
 
     @property
-    def can_be_lean(self) -> bool:
-        """Whether nothing but the Transformer's network reads latents."""
-        return self.encoders == "shared" and getattr(self.nesam, "soil", "map") == "map"
+    def looks_at_both(self) -> bool:
+        """Whether latents that the Transformer's network reads are read by NeSAM as well."""
+        return self.encoders == "shared" and getattr(self.nesam, "soil", "map") == "predicted"
 
     def init_params(
         self, key: jax.Array, transformer: Params, nesam: Params, gates: int = 1
@@ -323,20 +323,28 @@ class VertiWM:
         state: VehicleState,
     ) -> VertiWMHistory:
         """The history with what both see at a state."""
-        first, second = self.transformer.exteroception, self.nesam.exteroception
-        by_nesam = None
-        if self.encoders == "own" and first == second:
-            encoders = params.transformer.encoders, params.nesam.encoders
-            by_transformer, by_nesam = first.look(encoders, terrain, state)
-        else:
-            by_transformer = self.transformer.look(params.transformer, terrain, state)
-            if self.encoders == "own":
-                by_nesam = self.nesam.look(params.nesam, terrain, state)
+        by_transformer, by_nesam = self.look(params, terrain, state)
         return replace(
             history,
             transformer=replace(history.transformer, perception=by_transformer),
             nesam=replace(history.nesam, perception=by_nesam),
         )
+
+    def look(
+        self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState
+    ) -> tuple[Perception | Glance, Perception | Glance | None]:
+        """What the Transformer sees at a state, and NeSAM if it has encoders of its own."""
+        first, second = self.transformer.exteroception, self.nesam.exteroception
+        of_first = self.transformer.view(params.transformer)
+        if self.encoders == "shared":
+            return first.look((of_first,), terrain, state)[0], None
+        of_second = self.nesam.view(params.nesam)
+        if first == second:
+            by_transformer, by_nesam = first.look((of_first, of_second), terrain, state)
+        else:
+            (by_transformer,) = first.look((of_first,), terrain, state)
+            (by_nesam,) = second.look((of_second,), terrain, state)
+        return by_transformer, by_nesam
 
 
 def calibrate(

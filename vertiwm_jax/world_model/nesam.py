@@ -16,7 +16,16 @@ from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
 from vertiwm_jax.world_model import motion, step_features
 from vertiwm_jax.world_model.normalisation import Normalisation
-from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception
+from vertiwm_jax.world_model.perception import (
+    EncoderParams,
+    Exteroception,
+    Glance,
+    Perception,
+    Remembers,
+    View,
+    glance,
+    latents,
+)
 from vertiwm_jax.world_model.sizes import BASE, TransformerSize
 from vertiwm_jax.world_model.specialist_network import SpecialistNetwork
 from vertiwm_jax.world_model.step_features import StepFeatures
@@ -58,7 +67,7 @@ class NesamHistory:
     simulator: SimulatorHistory
     cache: KeyValueCache | None
     physics: VehicleState
-    perception: Perception | None
+    perception: Perception | Glance | None
 
 
 @dataclass(frozen=True)
@@ -77,6 +86,7 @@ class Nesam:
     soil: whose parameters physics uses: those that the "map" has for each class of ground, or
         those "predicted" from what the ground at the vehicle looks like, the same for all wheels.
     exteroception: how it looks at patches.
+    remembers: what its history has of a look; to predict soils, or to tune encoders, the latents.
     """
 
     size: TransformerSize = BASE
@@ -85,6 +95,15 @@ class Nesam:
     soil: SoilSource = "map"
     exteroception: Exteroception = Exteroception()
     simulator: Simulator = Simulator()
+    remembers: Remembers = "latents"
+
+    def __post_init__(self) -> None:
+        all_needed = self.soil == "predicted" or self.exteroception.tune_encoders
+        if self.remembers == "glance" and all_needed:
+            raise ValueError(
+                "remembers: expected latents to predict soils, or with encoders that are tuned, "
+                "found glance"
+            )
 
     def init_params(
         self,
@@ -193,17 +212,23 @@ class Nesam:
     def _network(self) -> SpecialistNetwork:
         return SpecialistNetwork(self.size)
 
-    def look(self, params: NesamParams, terrain: TerrainMap, state: VehicleState) -> Perception:
-        """What it sees at a state."""
-        return self.exteroception.look((params.encoders,), terrain, state)[0]
+    def look(
+        self, params: NesamParams, terrain: TerrainMap, state: VehicleState
+    ) -> Perception | Glance:
+        """What it remembers of a look at the ground."""
+        return self.exteroception.look((self.view(params),), terrain, state)[0]
+
+    def view(self, params: NesamParams) -> View:
+        """How it looks at patches."""
+        return View(params.encoders, latents if self.remembers == "latents" else glance)
 
     def _ground(
-        self, params: NesamParams, terrain: TerrainMap, perception: Perception | None
+        self, params: NesamParams, terrain: TerrainMap, perception: Perception | Glance | None
     ) -> TerrainMap:
         """The map with the soils that physics is to use."""
         if self.soil == "map":
             return terrain
-        assert perception is not None, "without a look it cannot predict the soil"
+        assert isinstance(perception, Perception), "without latents it cannot predict the soil"
         predicted = cast(Soil, _SOIL.apply(params.soil, perception.semantic, jnp.float32(0)))
         everywhere = jax.tree.map(
             lambda x: jnp.broadcast_to(x, terrain.deformable.shape), predicted

@@ -1,14 +1,15 @@
 """What a model perceives of the ground at a pose: queried patches and their latents (Eq. 2)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from typing import Any, Literal, Protocol, cast
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.dynamics import Dynamics, History, Params
-from vertiwm_jax.networks.encoder import TerrainEncoder, in_rows
+from vertiwm_jax.networks.encoder import Fours, TerrainEncoder, in_rows
 from vertiwm_jax.state import Command, Patches, VehicleState
 from vertiwm_jax.terrain import cells, crop
 from vertiwm_jax.terrain.crop import PATCH_PIXELS, PatchConfig
@@ -38,24 +39,21 @@ class Perception:
     @property
     def averaged(self) -> jax.Array:
         """`[..., 36]` the mean of every channel over space, e of Eq. 5."""
-        return averages((-3, -2), self.elevation, self.semantic)
-
-
-def averages(axes: tuple[int, ...], *latents: jax.Array) -> jax.Array:
-    """The means of latents `[..., 18]` over axes, side by side."""
-    return jnp.concatenate([jnp.mean(x, axis=axes) for x in latents], axis=-1)
+        means = [jnp.mean(x, axis=(-3, -2)) for x in (self.elevation, self.semantic)]
+        return jnp.concatenate(means, axis=-1)
 
 
 @struct.dataclass
 class Glance:
-    """What a model goes on with of a `Perception`: a quarter of it, and no latents.
+    """What a model goes on with of a `Perception`, without latents.
 
-    reduced: `[..., 256 C]` the C numbers that the Transformer's network makes of each cell.
     averaged: `[..., 36]` as that of `Perception`.
+    reduced: `[..., 256 C]` the C numbers that the Transformer's network makes of each cell; None
+        for a model whose network does not read the ground.
     """
 
-    reduced: jax.Array
     averaged: jax.Array
+    reduced: jax.Array | None = None
 
 
 @struct.dataclass
@@ -64,6 +62,36 @@ class EncoderParams:
 
     elevation: Any
     semantic: Any
+
+
+Remembers = Literal["latents", "glance"]
+"""What a model's history has of a look; see `world_model.choice.lean`."""
+
+
+Keep = Callable[[Any, Fours, Fours], Perception | Glance]
+
+
+def latents(_: Any, elevation: Fours, semantic: Fours) -> Perception:
+    """All of a look."""
+    return Perception(in_rows(elevation.latent), in_rows(semantic.latent))
+
+
+def glance(_: Any, elevation: Fours, semantic: Fours) -> Glance:
+    """The averages of the same."""
+    return Glance(jnp.concatenate([elevation.mean, semantic.mean]))
+
+
+@struct.dataclass
+class View:
+    """How one model looks at the ground.
+
+    keep: what it remembers, like `latents` and `glance`; static.
+    weights: which `keep` is given first.
+    """
+
+    encoders: EncoderParams
+    keep: Keep = struct.field(pytree_node=False, default=latents)
+    weights: Any = None
 
 
 @dataclass(frozen=True)
@@ -87,34 +115,24 @@ class Exteroception:
         )
 
     def look(
-        self, encoders: tuple[EncoderParams, ...], terrain: TerrainMap, state: VehicleState
-    ) -> tuple[Perception, ...]:
-        """What pairs of encoders see at one vehicle's pose, all of the same patches.
+        self, views: tuple[View, ...], terrain: TerrainMap, state: VehicleState
+    ) -> tuple[Perception | Glance, ...]:
+        """What models see at one vehicle's pose, all of the same patches.
 
-        The map counts as given, like the pose: unless encoders are tuned, no gradient flows.
+        The map counts as given, like the pose: unless encoders are tuned, no gradient flows, and
+        then latents are what is kept.
         """
         if self.tune_encoders:
             patches = self.query(terrain, state)
-            return tuple(self.encode(params, patches) for params in encoders)
-        given = jax.lax.stop_gradient((encoders, terrain, state))
+            return tuple(self.encode(view.encoders, patches) for view in views)
+        given = jax.lax.stop_gradient((views, terrain, state))
         return few_at_a_time(Exteroception._look, TOGETHER, self)(*given)
 
     def _look(
-        self, encoders: tuple[EncoderParams, ...], terrain: TerrainMap, state: VehicleState
-    ) -> tuple[Perception, ...]:
-        """`encode` of `query`, to rounding."""
-        return tuple(
-            Perception(in_rows(elevation), in_rows(semantic))
-            for elevation, semantic in self.see(encoders, terrain, state)
-        )
-
-    def see(
-        self, encoders: tuple[EncoderParams, ...], terrain: TerrainMap, state: VehicleState
-    ) -> tuple[tuple[jax.Array, jax.Array], ...]:
-        """Latents by each pair of encoders, of elevation and colours, four cells by four.
-
-        `[8, 8, 4, 18]`, in the order of `cells.projections`. Most pixels need not be drawn.
-        """
+        self, views: tuple[View, ...], terrain: TerrainMap, state: VehicleState
+    ) -> tuple[Perception | Glance, ...]:
+        """`encode` of `query`, to rounding. Most pixels need not be drawn."""
+        encoders = [view.encoders for view in views]
         of_elevation, of_semantic = (
             jnp.concatenate([params["params"]["cell_kernel"] for params in kind], axis=-1)
             for kind in ([p.elevation for p in encoders], [p.semantic for p in encoders])
@@ -122,13 +140,14 @@ class Exteroception:
         projected = cells.projections(
             terrain, state.position, state.rpy[2], self.patches, of_elevation[0], of_semantic
         )
-        of_each = zip(*(jnp.split(x, len(encoders), axis=-1) for x in projected), strict=True)
+        of_each = zip(*(jnp.split(x, len(views), axis=-1) for x in projected), strict=True)
         return tuple(
-            (
-                _of_fours(_ELEVATION, params.elevation, elevation),
-                _of_fours(_SEMANTIC, params.semantic, semantic),
+            view.keep(
+                view.weights,
+                _of_fours(_ELEVATION, view.encoders.elevation, elevation),
+                _of_fours(_SEMANTIC, view.encoders.semantic, semantic),
             )
-            for params, (elevation, semantic) in zip(encoders, of_each, strict=True)
+            for view, (elevation, semantic) in zip(views, of_each, strict=True)
         )
 
     def query(self, terrain: TerrainMap, state: VehicleState) -> Patches:
@@ -144,8 +163,8 @@ class Exteroception:
         return Perception(cast(jax.Array, elevation), cast(jax.Array, semantic))
 
 
-def _of_fours(encoder: TerrainEncoder, params: Any, projected: jax.Array) -> jax.Array:
-    return cast(jax.Array, encoder.apply(params, projected, method=TerrainEncoder.of_fours))
+def _of_fours(encoder: TerrainEncoder, params: Any, projected: jax.Array) -> Fours:
+    return cast(Fours, encoder.apply(params, projected, method=TerrainEncoder.of_fours))
 
 
 @struct.dataclass
@@ -160,8 +179,8 @@ class Eyes:
 
     def __call__(self, terrain: TerrainMap, state: VehicleState) -> Perception:
         """What they see at one vehicle's pose."""
-        (perception,) = self.exteroception.look((self.params,), terrain, state)
-        return perception
+        (perception,) = self.exteroception.look((View(self.params),), terrain, state)
+        return cast(Perception, perception)
 
 
 @struct.dataclass
@@ -212,16 +231,15 @@ class Sighted:
 class Specialist(Dynamics, Protocol):
     """A `Dynamics` whose step is a proposal, and then a look at where it leads.
 
-    Its parameters have a field `encoders`; its history has a field `perception` and can be changed
-    with `dataclasses.replace`. The fused model lets both specialists propose, fuses, and gives each
-    its perception of the fused state.
+    Its history has a field `perception` and can be changed with `dataclasses.replace`. The fused
+    model lets both specialists propose, fuses, and gives each its perception of the fused state.
     """
 
     @property
     def exteroception(self) -> Exteroception: ...
 
-    def look(self, params: Params, terrain: TerrainMap, state: VehicleState) -> Any:
-        """What `history.perception` is at a state."""
+    def view(self, params: Params) -> View:
+        """How `history.perception` is seen by that."""
         ...
 
     def propose(

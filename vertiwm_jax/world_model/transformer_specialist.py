@@ -7,24 +7,24 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.networks.encoder import LATENT_CHANNELS, in_rows
+from vertiwm_jax.networks.encoder import LATENT_CHANNELS, Fours, in_rows
 from vertiwm_jax.networks.transformer import KeyValueCache
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import motion
-from vertiwm_jax.world_model.batching import few_at_a_time
 from vertiwm_jax.world_model.normalisation import LOCAL, Normalisation
 from vertiwm_jax.world_model.perception import (
-    TOGETHER,
     EncoderParams,
     Exteroception,
     Glance,
     Perception,
-    averages,
+    Remembers,
+    View,
+    glance,
 )
 from vertiwm_jax.world_model.sizes import BASE, TransformerSize
-from vertiwm_jax.world_model.specialist_network import Ground, Reduction, SpecialistNetwork
+from vertiwm_jax.world_model.specialist_network import Ground, SpecialistNetwork
 
 
 @struct.dataclass
@@ -58,7 +58,7 @@ class TransformerSpecialist:
     size: TransformerSize = BASE
     terrain: Literal["patches", "indicator", "none"] = "patches"
     exteroception: Exteroception = Exteroception()
-    remembers: Literal["latents", "glance"] = "latents"
+    remembers: Remembers = "latents"
 
     def __post_init__(self) -> None:
         all_needed = self.terrain != "patches" or self.exteroception.tune_encoders
@@ -147,20 +147,14 @@ class TransformerSpecialist:
         """What it remembers of a look at the ground."""
         if self.terrain != "patches":
             return None
+        return self.exteroception.look((self.view(params),), terrain, state)[0]
+
+    def view(self, params: TransformerParams) -> View:
+        """How it looks at patches."""
         assert params.encoders is not None, "without encoders it cannot look at patches"
         if self.remembers == "latents":
-            return self.exteroception.look((params.encoders,), terrain, state)[0]
-        given = jax.lax.stop_gradient((params.encoders, terrain, state))
-        glance = few_at_a_time(TransformerSpecialist._glance, TOGETHER, self)
-        return glance(_not_learned(params.network["params"]["reduce"]), *given)
-
-    def _glance(
-        self, reduction: Any, encoders: EncoderParams, terrain: TerrainMap, state: VehicleState
-    ) -> Glance:
-        ((elevation, semantic),) = self.exteroception.see((encoders,), terrain, state)
-        network = Reduction(self.size.channels)
-        reduced = cast(jax.Array, network.apply({"params": reduction}, elevation, semantic))
-        return Glance(in_rows(reduced).ravel(), averages((0, 1, 2), elevation, semantic))
+            return View(params.encoders)
+        return View(params.encoders, _glance, _not_learned(params.network["params"]["reduce"]))
 
     def _inputs(
         self,
@@ -179,6 +173,13 @@ class TransformerSpecialist:
             soil = terrain.deformable[below.semantic]
             ground = soil[..., None].astype(jnp.float32)
         return jnp.concatenate(parts, axis=-1), ground
+
+
+def _glance(reduction: Any, elevation: Fours, semantic: Fours) -> Glance:
+    """With what `Reduction` makes of latents that need not be made for it."""
+    of_elevation, of_semantic = jnp.split(reduction["kernel"], 2)
+    reduced = elevation.times(of_elevation) + semantic.times(of_semantic) + reduction["bias"]
+    return replace(glance(None, elevation, semantic), reduced=in_rows(reduced).ravel())
 
 
 @jax.custom_jvp
