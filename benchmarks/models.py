@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -10,15 +10,20 @@ import jax.numpy as jnp
 from benchmarks._harness import Figures, measure, parser, report
 from vertiwm_jax.dynamics import Params, rollout
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
+from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.worlds import WorldConfig
 from vertiwm_jax.world_model.choice import ModelName, choose, lean
+from vertiwm_jax.world_model.model import ModelConfig, VertiWM, VertiWMParams
 
+Size = Literal["base", "paper"]
+"""Of Verti-WM: the one that comes along, or one of the paper's size and with four encoders."""
 BATCHES = (1, 20, 256, 1024)
 STEPS = 20
+PAPER = ModelConfig(size="paper")
 
 
 def drives(batch: int, steps: int) -> tuple[TerrainMap, VehicleState, Command]:
@@ -39,6 +44,11 @@ def drives(batch: int, steps: int) -> tuple[TerrainMap, VehicleState, Command]:
     xy = jax.random.uniform(keys[2], (batch, 2), minval=-40.0, maxval=40.0)
     yaw = jax.random.uniform(keys[3], (batch,), minval=-jnp.pi, maxval=jnp.pi)
     return terrain, jax.jit(jax.vmap(place))(xy, yaw), commands
+
+
+def untrained() -> tuple[VertiWM, VertiWMParams]:
+    """A Verti-WM of the paper's size with random weights, for none comes along."""
+    return PAPER.build(), PAPER.init_params(jax.random.key(0), chrono_like(hmmwv()))
 
 
 def rates(name: ModelName, weights: Path | None, batches: Sequence[int]) -> dict[str, Figures]:

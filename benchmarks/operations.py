@@ -1,4 +1,4 @@
-"""The longest operations of a step of the shipped Verti-WM, or of a part of it, as XLA runs them.
+"""The longest operations of a step of Verti-WM, or of a part of it, as XLA runs them.
 
 Of one device of a CPU (`taskset -c 0`), as JAX's profiler records them, which itself takes about a
 microsecond a call. Loops and branches are left out, for what is in them is told by itself.
@@ -8,11 +8,12 @@ import re
 import tempfile
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jax
 
 from benchmarks._harness import Figures, parser, report
+from benchmarks.models import Size
 from benchmarks.world_model_step import over_vehicles, parts
 
 _CALLS = 20
@@ -52,10 +53,11 @@ def recorded(compiled: Any, arguments: tuple[Any, ...]) -> dict[str, tuple[float
 def main() -> None:
     arguments = parser(__doc__)
     arguments.add_argument("--batch", type=int, default=128, help="vehicles")
+    arguments.add_argument("--size", choices=get_args(Size), default="base", help="of Verti-WM")
     arguments.add_argument("--part", default="the whole step", help="as world_model_step has them")
     arguments.add_argument("--longest", type=int, default=30, help="how many")
     chosen = arguments.parse_args()
-    known = parts(chosen.batch)
+    known = parts(chosen.batch, chosen.size)
     if chosen.part not in known:
         arguments.error(f"--part: expected one of {', '.join(known)}, found {chosen.part}")
     part = known[chosen.part]

@@ -16,11 +16,10 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from benchmarks._harness import Figures, measure, parser, report
+from benchmarks.models import PAPER, Size, untrained
 from vertiwm_jax import config as configuration
 from vertiwm_jax import devices
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
-from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
 from vertiwm_jax.rl.loop import Seeds
@@ -76,19 +75,11 @@ def of_task(name: str, model: ModelName, weights: Path | None, operands: Operand
     return iteration(config.algorithm(training.env), training.params, config.action_repeat)
 
 
-def untrained(folder: Path) -> Path:
-    """The folder, with a Verti-WM of the paper's size in it."""
-    config = world_model.ModelConfig(size="paper")
-    params = config.init_params(jax.random.key(0), chrono_like(hmmwv()))
-    world_model.save(folder, config, params)
-    return folder
-
-
 def main() -> None:
     arguments = parser(__doc__)
     arguments.add_argument("--configs", nargs="+", default=("ppo", "ppo_paper"))
     arguments.add_argument("--models", nargs="+", default=("builtin", "vertiwm"))
-    arguments.add_argument("--size", choices=("base", "paper"), default="base", help="of Verti-WM")
+    arguments.add_argument("--size", choices=get_args(Size), default="base", help="of Verti-WM")
     arguments.add_argument(
         "--operands", nargs="+", choices=get_args(Operands), default=("float32",), help="of models"
     )
@@ -96,7 +87,10 @@ def main() -> None:
     idle = environment.EnvParams(max_steps_in_episode=600)
     results = {"algorithm alone": iteration(PPO(IdleEnv(), PPOTraining().ppo), idle)}
     with tempfile.TemporaryDirectory() as folder:
-        weights = untrained(Path(folder)) if chosen.size == "paper" else None
+        weights = None
+        if chosen.size == "paper":
+            weights = Path(folder)
+            world_model.save(weights, PAPER, untrained()[1])
         for name in chosen.configs:
             for model in chosen.models:
                 for operands in chosen.operands:

@@ -1,4 +1,6 @@
-"""A step of the shipped Verti-WM, part by part: what it has to compute, and what that takes.
+"""A step of Verti-WM, part by part: what it has to compute, and what that takes.
+
+It is the one that comes along, or with `--size paper` one of the paper's size, untrained.
 
 The floor of a part is what its FLOPs, or its inputs and outputs, would take at the machine's own
 ceilings, which are measured first: a matmul of 1024 x 1024, and adding a large array to another,
@@ -6,6 +8,7 @@ in place and time and again, for new memory comes several times slower.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, get_args
 
@@ -13,77 +16,74 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks._harness import Figures, measure, parser, report
-from benchmarks.models import drives
+from benchmarks.models import Size, drives, untrained
 from vertiwm_jax.world_model import fusion
 from vertiwm_jax.world_model.choice import Operands, lean
 from vertiwm_jax.world_model.fusion import Proposal
 from vertiwm_jax.world_model.model import VertiWM
 
 Part = tuple[Callable[..., Any], tuple[Any, ...]]
-"""A function of the map and of vehicles, over which it is vmapped, and their arguments."""
+"""A function of weights, of the map and of vehicles, over which it is vmapped, and what it gets."""
 _SUMS = 16
 
 
 def over_vehicles(part: Part) -> Callable[..., Any]:
-    """The function compiled; a map that it closed over would be a constant of the program."""
+    """The function compiled; weights and a map that it closed over would be its constants."""
     function, arguments = part
-    return jax.jit(jax.vmap(function, (None, *(0 for _ in arguments[1:]))))
+    return jax.jit(jax.vmap(function, (None, None, *(0 for _ in arguments[2:]))))
 
 
-def parts(batch: int) -> dict[str, Part]:
+def parts(batch: int, size: Size = "base") -> dict[str, Part]:
     """Every part of a step on `batch` vehicles after their first step, and the whole."""
-    model, params = VertiWM.pretrained()
+    model, params = VertiWM.pretrained() if size == "base" else untrained()
     model = lean(model)
     transformer, nesam = model.transformer, model.nesam
     terrain, states, commands = drives(batch, 1)
     command = jax.tree.map(lambda x: x[:, 0], commands)
 
-    def step(terrain: Any, history: Any, state: Any, command: Any) -> Any:
-        return model.step(params, terrain, history, state, command)
+    start = jax.jit(jax.vmap(model.init, (None, None, 0)))
+    begun = (params, terrain, start(params, terrain, states), states, command)
+    state, history = over_vehicles((model.step, begun))(*begun)
 
-    start = jax.jit(jax.vmap(lambda state: model.init(params, terrain, state)))
-    begun = (terrain, start(states), states, command)
-    state, history = over_vehicles((step, begun))(*begun)
+    def physics(simulator: Any, terrain: Any, memory: Any, state: Any, command: Any) -> Any:
+        return nesam.simulator.step(simulator, terrain, memory, state, command)
 
-    first, second = (
-        jax.jit(jax.vmap(lambda m, s, c, one=one, p=p: one.propose(p, terrain, m, s, c)[0]))(
-            memory, state, command
-        )
-        for one, p, memory in (
-            (transformer, params.transformer, history.transformer),
-            (nesam, params.nesam, history.nesam),
-        )
-    )
-
-    def physics(terrain: Any, memory: Any, state: Any, command: Any) -> Any:
-        return nesam.simulator.step(params.nesam.simulator, terrain, memory, state, command)
-
-    def gate(_: Any, history: Any, state: Any, command: Any, first: Any, second: Any) -> Any:
+    def gate(
+        gates: Any, _: Any, history: Any, state: Any, command: Any, first: Any, second: Any
+    ) -> Any:
         proposals = (
             Proposal.of(state, first, history.perception),
-            Proposal.of(state, second, history.perception),
+            Proposal.of(state, second, history.nesam.perception or history.perception),
         )
         context = fusion.context(state, command, *proposals, model.gate_terrain)
-        alphas, hidden = model.weigh(params.gate, context, history.hidden)
+        alphas, hidden = model.weigh(gates, context, history.hidden)
         return fusion.fuse(state, *proposals, alphas.mean(axis=0)), hidden
 
     driven = (state, command)
+    of_first = (params.transformer, terrain, history.transformer, *driven)
+    of_second = (params.nesam, terrain, history.nesam, *driven)
+    first, second = (
+        over_vehicles((one.propose, arguments))(*arguments)[0]
+        for one, arguments in ((transformer, of_first), (nesam, of_second))
+    )
+    # What is not read would count as bytes.
+    reduction = {"params": {"reduce": params.transformer.network["params"]["reduce"]}}
+    eyes = replace(
+        params,
+        transformer=replace(params.transformer, network=reduction),
+        nesam=replace(params.nesam, network=None, soil=None),
+        gate=None,
+    )
     return {
-        "map query and encoders": (
-            lambda t, state: transformer.look(params.transformer, t, state),
-            (terrain, state),
+        "map query and encoders": (model.look, (eyes, terrain, state)),
+        "Transformer": (transformer.propose, of_first),
+        "NeSAM: physics": (
+            physics,
+            (params.nesam.simulator, terrain, history.nesam.simulator, *driven),
         ),
-        "Transformer": (
-            lambda t, m, s, c: transformer.propose(params.transformer, t, m, s, c),
-            (terrain, history.transformer, *driven),
-        ),
-        "NeSAM: physics": (physics, (terrain, history.nesam.simulator, *driven)),
-        "NeSAM: physics and network": (
-            lambda t, m, s, c: nesam.propose(params.nesam, t, m, s, c),
-            (terrain, history.nesam, *driven),
-        ),
-        "gate and fused motion": (gate, (terrain, history, *driven, first, second)),
-        "the whole step": (step, (terrain, history, *driven)),
+        "NeSAM: physics and network": (nesam.propose, of_second),
+        "gate and fused motion": (gate, (params.gate, terrain, history, *driven, first, second)),
+        "the whole step": (model.step, (params, terrain, history, *driven)),
     }
 
 
@@ -103,21 +103,21 @@ def ceilings() -> dict[str, float]:
 
 
 def cost(part: Part, batch: int) -> tuple[float, float]:
-    """FLOPs of one vehicle, and bytes that it reads and leaves, at least.
+    """FLOPs of one vehicle, and bytes that it reads and leaves, with its share of the weights.
 
     The compiler counts the operations of a loop once: those of physics are of one sub-step.
     """
-    function, (terrain, *arguments) = part
+    function, (weights, terrain, *arguments) = part
     alone = jax.tree.map(lambda x: x[0], arguments)
-    flops = jax.jit(function).lower(terrain, *alone).compile().cost_analysis()["flops"]
-    results = jax.eval_shape(over_vehicles(part), terrain, *arguments)
-    leaves = jax.tree.leaves((arguments, results))
+    flops = jax.jit(function).lower(weights, terrain, *alone).compile().cost_analysis()["flops"]
+    results = jax.eval_shape(over_vehicles(part), weights, terrain, *arguments)
+    leaves = jax.tree.leaves((weights, arguments, results))
     return flops, sum(leaf.size * leaf.dtype.itemsize for leaf in leaves) / batch
 
 
-def figures(batch: int) -> dict[str, Figures]:
+def figures(batch: int, size: Size) -> dict[str, Figures]:
     """A row for every part."""
-    limits, chosen = ceilings(), parts(batch)
+    limits, chosen = ceilings(), parts(batch, size)
     times = {name: measure(over_vehicles(part), *part[1]) for name, part in chosen.items()}
     whole = times["the whole step"]["median_s"]
     rows: dict[str, Figures] = {
@@ -128,11 +128,11 @@ def figures(batch: int) -> dict[str, Figures]:
         }
     }
     for name, part in chosen.items():
-        flops, size = cost(part, batch)
-        floor = max(flops / limits["flops"], size / limits["bytes"])
+        flops, moved = cost(part, batch)
+        floor = max(flops / limits["flops"], moved / limits["bytes"])
         rows[f"batch {batch}: {name}"] = {
             "kFLOP": flops / 1e3,
-            "kB": size / 1e3,
+            "kB": moved / 1e3,
             "floor_us": 1e6 * floor,
             "measured_us": 1e6 * times[name]["median_s"] / batch,
             "share": times[name]["median_s"] / whole,
@@ -144,10 +144,11 @@ def figures(batch: int) -> dict[str, Figures]:
 def main() -> None:
     arguments = parser(__doc__)
     arguments.add_argument("--batches", nargs="+", type=int, default=(1, 20, 256, 1024, 4096))
+    arguments.add_argument("--size", choices=get_args(Size), default="base", help="of Verti-WM")
     chosen = arguments.parse_args()
     results: dict[str, Figures] = {}
     for batch in chosen.batches:
-        results |= figures(batch)
+        results |= figures(batch, chosen.size)
     report("world_model_step", results, chosen.json)
 
 
