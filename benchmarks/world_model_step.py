@@ -21,6 +21,7 @@ from vertiwm_jax.world_model import fusion
 from vertiwm_jax.world_model.choice import Operands, lean
 from vertiwm_jax.world_model.fusion import Proposal
 from vertiwm_jax.world_model.model import VertiWM
+from vertiwm_jax.world_model.perception import Glance
 
 Part = tuple[Callable[..., Any], tuple[Any, ...]]
 """A function of weights, of the map and of vehicles, over which it is vmapped, and what it gets."""
@@ -48,24 +49,23 @@ def parts(batch: int, size: Size = "base") -> dict[str, Part]:
     def physics(simulator: Any, terrain: Any, memory: Any, state: Any, command: Any) -> Any:
         return nesam.simulator.step(simulator, terrain, memory, state, command)
 
+    seen = Glance(history.perception.averaged)
+
     def gate(
-        gates: Any, _: Any, history: Any, state: Any, command: Any, first: Any, second: Any
+        gates: Any, _: Any, seen: Any, hidden: Any, state: Any, command: Any, *proposed: Any
     ) -> Any:
-        proposals = (
-            Proposal.of(state, first, history.perception),
-            Proposal.of(state, second, history.nesam.perception or history.perception),
-        )
+        proposals = [Proposal.of(state, of_one, seen) for of_one in proposed]
         context = fusion.context(state, command, *proposals, model.gate_terrain)
-        alphas, hidden = model.weigh(gates, context, history.hidden)
+        alphas, hidden = model.weigh(gates, context, hidden)
         return fusion.fuse(state, *proposals, alphas.mean(axis=0)), hidden
 
     driven = (state, command)
     of_first = (params.transformer, terrain, history.transformer, *driven)
     of_second = (params.nesam, terrain, history.nesam, *driven)
-    first, second = (
+    proposed = [
         over_vehicles((one.propose, arguments))(*arguments)[0]
         for one, arguments in ((transformer, of_first), (nesam, of_second))
-    )
+    ]
     # What is not read would count as bytes.
     reduction = {"params": {"reduce": params.transformer.network["params"]["reduce"]}}
     eyes = replace(
@@ -82,7 +82,10 @@ def parts(batch: int, size: Size = "base") -> dict[str, Part]:
             (params.nesam.simulator, terrain, history.nesam.simulator, *driven),
         ),
         "NeSAM: physics and network": (nesam.propose, of_second),
-        "gate and fused motion": (gate, (params.gate, terrain, history, *driven, first, second)),
+        "gate and fused motion": (
+            gate,
+            (params.gate, terrain, seen, history.hidden, *driven, *proposed),
+        ),
         "the whole step": (model.step, (params, terrain, history, *driven)),
     }
 
