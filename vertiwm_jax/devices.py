@@ -63,7 +63,7 @@ def use_cores() -> None:
 def multiplies_bfloat16() -> bool:
     """Whether this is a CPU that multiplies matrices of bfloat16 clearly faster than of float32.
 
-    It is tried, which takes a tenth of a second. Of several hosts, which all have to ask, it is
+    It is tried, which takes half a second. Of several hosts, which all have to ask, it is
     what the first one finds.
     """
     if jax.default_backend() != "cpu":
@@ -245,11 +245,11 @@ def whole(tree: T) -> T:
 
 
 def _seconds_of_matmul(*dtypes: Any) -> list[float]:
-    """The shortest of some products of matrices of each type, in turns."""
+    """The shortest of many products of matrices of each type, in turns: others may be busy here."""
     matmul = jax.jit(partial(jnp.matmul, preferred_element_type=jnp.float32))
     operands = [(jnp.ones((256, 512), kind), jnp.ones((512, 512), kind)) for kind in dtypes]
     seconds = []
-    for _ in range(11):  # The first of which compiles.
+    for _ in range(200):  # The first of which compiles.
         for pair in operands:
             start = time.perf_counter()
             matmul(*pair).block_until_ready()
