@@ -39,7 +39,13 @@ def save(folder: str | Path, step: int, state: Any, keep: int) -> Path:
         if hosts.is_first():
             _clean(folder)
         with _quiet():
-            ocp.save(str(path), jax.device_get(hosts.without_keys(_flatten(state))))
+            leaves = jax.device_get(hosts.without_keys(_flatten(state)))
+            writing = ocp.save_async(str(path), leaves)
+            try:
+                writing.result()
+            except KeyboardInterrupt:
+                writing.result()  # Its threads hang where Python ends before they do.
+                raise
     # The storage library reports what the system refuses as ValueError.
     except (OSError, ValueError) as error:
         _clean(folder)
