@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,6 @@ from vertiwm_jax.terrain.worlds import WorldConfig
 from vertiwm_jax.world_model.choice import ModelName, choose, lean
 from vertiwm_jax.world_model.model import ModelConfig, VertiWM, VertiWMParams
 
-Size = Literal["base", "paper"]
-"""Of Verti-WM: the one that comes along, or one of the paper's size and with four encoders."""
 BATCHES = (1, 20, 256, 1024)
 STEPS = 20
 PAPER = ModelConfig(size="paper")

@@ -13,8 +13,8 @@ from typing import Any, get_args
 import jax
 
 from benchmarks._harness import Figures, parser, report
-from benchmarks.models import Size
 from benchmarks.world_model_step import over_vehicles, parts
+from vertiwm_jax.world_model.model import Size
 
 _CALLS = 20
 _AROUND = ("while", "conditional", "call")  # what other operations are in

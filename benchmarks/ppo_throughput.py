@@ -16,7 +16,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from benchmarks._harness import Figures, measure, parser, report
-from benchmarks.models import PAPER, Size, untrained
+from benchmarks.models import PAPER, untrained
 from vertiwm_jax import config as configuration
 from vertiwm_jax import devices
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
@@ -26,6 +26,7 @@ from vertiwm_jax.rl.loop import Seeds
 from vertiwm_jax.rl.ppo import PPO
 from vertiwm_jax.world_model import model as world_model
 from vertiwm_jax.world_model.choice import ModelName, Operands
+from vertiwm_jax.world_model.model import Size
 
 
 @struct.dataclass

@@ -16,11 +16,11 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks._harness import Figures, measure, parser, report
-from benchmarks.models import Size, drives, untrained
+from benchmarks.models import drives, untrained
 from vertiwm_jax.world_model import fusion
 from vertiwm_jax.world_model.choice import Operands, lean
 from vertiwm_jax.world_model.fusion import Proposal
-from vertiwm_jax.world_model.model import VertiWM
+from vertiwm_jax.world_model.model import Size, VertiWM
 from vertiwm_jax.world_model.perception import Glance
 
 Part = tuple[Callable[..., Any], tuple[Any, ...]]
@@ -34,7 +34,7 @@ def over_vehicles(part: Part) -> Callable[..., Any]:
     return jax.jit(jax.vmap(function, (None, None, *(0 for _ in arguments[2:]))))
 
 
-def parts(batch: int, size: Size = "base") -> dict[str, Part]:
+def parts(batch: int, size: Size) -> dict[str, Part]:
     """Every part of a step on `batch` vehicles after their first step, and the whole."""
     model, params = VertiWM.pretrained() if size == "base" else untrained()
     model = lean(model)
@@ -49,7 +49,7 @@ def parts(batch: int, size: Size = "base") -> dict[str, Part]:
     def physics(simulator: Any, terrain: Any, memory: Any, state: Any, command: Any) -> Any:
         return nesam.simulator.step(simulator, terrain, memory, state, command)
 
-    seen = Glance(history.perception.averaged)
+    seen = Glance(history.perception.averaged)  # All that gates read, as much of either specialist.
 
     def gate(
         gates: Any, _: Any, seen: Any, hidden: Any, state: Any, command: Any, *proposed: Any

@@ -92,6 +92,28 @@ def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, capfd):
     checkpoints.save(tmp_path, 2, large, keep=1)
 
 
+def test_an_interrupted_write_is_waited_for(tmp_path, monkeypatch):
+    """What it runs in the background would hang if Python ended before it."""
+    asked = []
+    begin = checkpoints.ocp.save_async
+
+    class Interrupted:
+        def __init__(self, *args):
+            self.writing = begin(*args)
+
+        def result(self):
+            asked.append(self)
+            if len(asked) == 1:
+                raise KeyboardInterrupt
+            self.writing.result()
+
+    monkeypatch.setattr(checkpoints.ocp, "save_async", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        checkpoints.save(tmp_path, 1, state(), keep=1)
+    assert len(asked) == 2
+    chex.assert_trees_all_equal(checkpoints.load(tmp_path / "1", jax.eval_shape(state)), state())
+
+
 WRITER = """
 import sys, jax
 from vertiwm_jax import checkpoints

@@ -62,11 +62,6 @@ def test_bfloat16_has_to_be_clearly_faster(half, faster, monkeypatch):
     assert devices.multiplies_bfloat16.__wrapped__() is faster
 
 
-def test_matmuls_are_timed_by_type():
-    seconds = devices._seconds_of_matmul(jnp.float32, jnp.bfloat16)
-    assert len(seconds) == 2 and all(0 < one < 1 for one in seconds)
-
-
 def test_each_device_has_its_share_of_the_rows(two):
     with jax.set_mesh(two):
         program = jax.jit(devices.spread(jnp.sin, (0,), 4)).lower(jnp.zeros(64))

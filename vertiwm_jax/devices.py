@@ -244,6 +244,16 @@ def whole(tree: T) -> T:
     return _placed(tree, PartitionSpec())
 
 
+def number() -> int:
+    """Devices to share out to, here."""
+    around = jax.sharding.get_abstract_mesh()
+    return around.shape[AXIS] if AXIS in around.auto_axes else 1
+
+
+def _placed(tree: T, places: PartitionSpec) -> T:
+    return jax.lax.with_sharding_constraint(tree, places) if number() > 1 else tree
+
+
 def _seconds_of_matmul(*dtypes: Any) -> list[float]:
     """The shortest of many products of matrices of each type, in turns: others may be busy here."""
     matmul = jax.jit(partial(jnp.matmul, preferred_element_type=jnp.float32))
@@ -255,13 +265,3 @@ def _seconds_of_matmul(*dtypes: Any) -> list[float]:
             matmul(*pair).block_until_ready()
             seconds.append(time.perf_counter() - start)
     return np.reshape(seconds, (-1, len(dtypes))).min(axis=0).tolist()
-
-
-def number() -> int:
-    """Devices to share out to, here."""
-    around = jax.sharding.get_abstract_mesh()
-    return around.shape[AXIS] if AXIS in around.auto_axes else 1
-
-
-def _placed(tree: T, places: PartitionSpec) -> T:
-    return jax.lax.with_sharding_constraint(tree, places) if number() > 1 else tree

@@ -12,6 +12,7 @@ from flax import struct
 from vertiwm_jax.state import CELL_PIXELS
 
 LATENT_CHANNELS = 18
+_COARSE = 23
 
 
 class TerrainEncoder(nn.Module):
@@ -31,8 +32,8 @@ class TerrainEncoder(nn.Module):
         self.cell_kernel = self.param("cell_kernel", _analysis, shape)
         self.cell_bias = self.param("cell_bias", nn.initializers.zeros, (LATENT_CHANNELS,))
         self.Conv_0 = _Halving(24)
-        self.Conv_1 = nn.Conv(23, (3, 3))
-        self.expand = _Linear(23, 4 * LATENT_CHANNELS)
+        self.Conv_1 = nn.Conv(_COARSE, (3, 3))
+        self.expand = _Linear(_COARSE, 4 * LATENT_CHANNELS)
 
     def __call__(self, patch: jax.Array) -> jax.Array:
         """`[..., 128, 128, channels]` in about [-1, 1] to `[..., 16, 16, 18]`."""
@@ -52,8 +53,8 @@ class TerrainEncoder(nn.Module):
 class Fours:
     """A latent of four cells by four, whose sum need not be made to know what is linear in it.
 
-    fine: `[..., 8, 8, 4 * 18]` one addend; the other is `coarse` `[..., 8, 8, I]`, a number of
-        features, times `kernel` `[I, 4 * 18]`, and `bias` `[4 * 18]`.
+    fine: `[..., 8, 8, 4 * 18]` one addend; the other is `coarse` `[..., 8, 8, 23]` times `kernel`
+        `[23, 4 * 18]`, and `bias` `[4 * 18]`.
     """
 
     fine: jax.Array
@@ -72,7 +73,7 @@ class Fours:
         fine, coarse = (jnp.mean(x, axis=(-3, -2)) for x in (self.fine, self.coarse))
         return jnp.mean(_of_each(fine + coarse @ self.kernel + self.bias), axis=-2)
 
-    def times(self, matrix: jax.Array) -> jax.Array:
+    def __matmul__(self, matrix: jax.Array) -> jax.Array:
         """The latent times `[18, C]`, `[..., 8, 8, 4, C]`."""
         kernel, bias = _of_each(self.kernel) @ matrix, _of_each(self.bias) @ matrix
         added = self.coarse @ kernel.reshape(len(kernel), -1)
@@ -86,7 +87,7 @@ def _of_each(fours: jax.Array) -> jax.Array:
 
 
 class _Linear(nn.Module):
-    """The weights of a `nn.Dense`."""
+    """The weights of a `nn.Dense`, which begin as zeros, for who multiplies otherwise."""
 
     inputs: int
     outputs: int

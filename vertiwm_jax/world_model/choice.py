@@ -65,7 +65,7 @@ def sighted(
     config, seen_by = _eyes(weights)
     seeing = {"vertiwm", "transformer"} | ({"nesam"} if config.encoders == "shared" else set())
     if name in seeing:
-        if isinstance(dynamics, VertiWM):
+        if isinstance(dynamics, VertiWM):  # What policies see is the Transformer's.
             dynamics = replace(dynamics, nesam=lean(dynamics.nesam))
         return dynamics, params
     return Sighted(dynamics), SightedParams(params, seen_by)

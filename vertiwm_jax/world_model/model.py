@@ -21,17 +21,18 @@ from vertiwm_jax.world_model.fusion import CONTEXT_SIZE, POSITION_AND_YAW, GateT
 from vertiwm_jax.world_model.nesam import Nesam, SoilSource
 from vertiwm_jax.world_model.normalisation import Normalisation
 from vertiwm_jax.world_model.perception import Glance, Perception, Specialist
-from vertiwm_jax.world_model.sizes import BASE, PAPER
+from vertiwm_jax.world_model.sizes import BASE, PAPER, TransformerSize
 from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
 
 Part = Literal["transformer", "nesam", "gate"]
+Size = Literal["base", "paper"]
 Encoders = Literal["own", "shared"]
 """Whether each specialist has a pair of encoders, or NeSAM sees through the Transformer's."""
 PRETRAINED = Path(__file__).parents[1] / "weights"
 """Folder of the model that comes with the package; its model card is `docs/model_card.md`."""
 _CONFIG = "model.yaml"
 _CONSTANT = 1e-6
-_SIZES = {"base": BASE, "paper": PAPER}
+_SIZES: dict[Size, TransformerSize] = {"base": BASE, "paper": PAPER}
 _GATE = Gate()
 
 
@@ -103,7 +104,7 @@ class ModelConfig:
 
     parts: tuple[Part, ...] = ("transformer", "nesam", "gate")
     """What of it is fitted; each part can be used alone, the gate needs both others."""
-    size: Literal["base", "paper"] = "base"
+    size: Size = "base"
     """Of both specialists' networks."""
     terrain: Literal["patches", "indicator", "none"] = "patches"
     """What the Transformer is told of the ground; less than patches only to compare with."""

@@ -66,9 +66,8 @@ class EncoderParams:
 
 Remembers = Literal["latents", "glance"]
 """What a model's history has of a look; see `world_model.choice.lean`."""
-
-
 Keep = Callable[[Any, Fours, Fours], Perception | Glance]
+"""Makes that of weights, if it needs some, and of latents of elevation and of colours."""
 
 
 def latents(_: Any, elevation: Fours, semantic: Fours) -> Perception:

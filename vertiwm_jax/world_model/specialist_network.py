@@ -4,7 +4,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax.networks.encoder import LATENT_CHANNELS
+from vertiwm_jax.networks.encoder import LATENT_CHANNELS, Fours
 from vertiwm_jax.networks.layers import Dense
 from vertiwm_jax.networks.transformer import KeyValueCache, Transformer
 from vertiwm_jax.world_model.perception import Glance, Perception
@@ -64,7 +64,7 @@ class Reduction(nn.Module):
     channels: int
 
     @nn.compact
-    def __call__(self, elevation: jax.Array, semantic: jax.Array) -> jax.Array:
+    def __call__(self, elevation: jax.Array | Fours, semantic: jax.Array | Fours) -> jax.Array:
         """Latents `[..., 18]` of each to `[..., channels]`."""
         shape = 2 * LATENT_CHANNELS, self.channels
         kernel = self.param("kernel", nn.linear.default_kernel_init, shape)

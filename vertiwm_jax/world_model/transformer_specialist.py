@@ -24,7 +24,7 @@ from vertiwm_jax.world_model.perception import (
     glance,
 )
 from vertiwm_jax.world_model.sizes import BASE, TransformerSize
-from vertiwm_jax.world_model.specialist_network import Ground, SpecialistNetwork
+from vertiwm_jax.world_model.specialist_network import Ground, Reduction, SpecialistNetwork
 
 
 @struct.dataclass
@@ -176,9 +176,8 @@ class TransformerSpecialist:
 
 
 def _glance(reduction: Any, elevation: Fours, semantic: Fours) -> Glance:
-    """With what `Reduction` makes of latents that need not be made for it."""
-    of_elevation, of_semantic = jnp.split(reduction["kernel"], 2)
-    reduced = elevation.times(of_elevation) + semantic.times(of_semantic) + reduction["bias"]
+    network = Reduction(channels=len(reduction["bias"]))
+    reduced = cast(jax.Array, network.apply({"params": reduction}, elevation, semantic))
     return replace(glance(None, elevation, semantic), reduced=in_rows(reduced).ravel())
 
 
