@@ -5,6 +5,7 @@ frozen, hashable object with two pure functions of one vehicle. Batches are made
 trajectories by `lax.scan`; weights, maps and state are arguments.
 """
 
+from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -38,6 +39,19 @@ class Dynamics(Protocol):
         state: VehicleState,
         command: Command,
     ) -> tuple[VehicleState, History]: ...
+
+
+@partial(jax.jit, static_argnames="dynamics")
+def step(
+    dynamics: Dynamics,
+    params: Params,
+    terrain: TerrainMap,
+    history: History,
+    state: VehicleState,
+    command: Command,
+) -> tuple[VehicleState, History]:
+    """`dynamics.step`, which all programs that call it like this trace only once."""
+    return dynamics.step(params, terrain, history, state, command)
 
 
 def disagreement(history: History) -> jax.Array:

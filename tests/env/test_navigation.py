@@ -8,6 +8,7 @@ import pytest
 from env.worlds import BICYCLE, Scripted, bicycle_env, ground, hills, step_of_many, task
 from flax import struct
 
+from vertiwm_jax import devices
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.navigation import NavigationEnv
@@ -18,6 +19,8 @@ from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.world_model.choice import lean
+from vertiwm_jax.world_model.model import VertiWM
 
 KEY = jax.random.key(0)
 AHEAD = jnp.array([1.0, 0.0])
@@ -212,6 +215,30 @@ def test_step_compiles_once_and_resets_by_itself():
     final, first = np.asarray(info["final_observation"]), np.asarray(out[0])
     assert (final[:, 2] > 0.1).all() and (first[:, 2] == 0).all()
     assert set(map(bytes, first)) <= set(map(bytes, np.asarray(params.start_observation)))
+
+
+def test_a_model_is_traced_once_for_starts_and_for_steps(monkeypatch):
+    model, params = VertiWM.pretrained()
+    traced, step = [], VertiWM.step
+
+    def noted(self, *args):
+        traced.append(self)
+        return step(self, *args)
+
+    monkeypatch.setattr(VertiWM, "step", noted)
+    terrain = ground(hills())
+    pool = circle_tasks(terrain, 55.0, 4)
+    env, number = NavigationEnv(lean(model)), len(pool.world)
+    shapes = env.shapes(params, terrain, pool)
+    mesh = devices.mesh(number)
+    keys, actions = jax.random.split(KEY, number), jnp.zeros((number, 2))
+    given = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=devices.on_all(mesh)),
+        (keys, shapes.starts, actions, shapes),
+    )
+    with jax.set_mesh(mesh):
+        jax.eval_shape(devices.spread(env.step, (0, 0, 0, None)), *given)
+    assert len(traced) == 1
 
 
 def test_worlds_are_not_copied_per_vehicle():

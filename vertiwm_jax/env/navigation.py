@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnax.environments import environment, spaces
 
-from vertiwm_jax.dynamics import EMBEDDING_SHAPE, Dynamics, Params, disagreement, spread
+from vertiwm_jax.dynamics import EMBEDDING_SHAPE, Dynamics, Params, disagreement, spread, step
 from vertiwm_jax.env import observation
 from vertiwm_jax.env.episode import NavigationConfig, NavigationParams, NavigationState, see
 from vertiwm_jax.env.reward import reward
@@ -89,8 +89,8 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
         arriving, variation = state.variation.arriving(action)
         ground, command = state.variation.ground(terrain), config.command(arriving)
-        moved, history = self.dynamics.step(
-            params.dynamics, ground, state.history, state.vehicle, command
+        moved, history = step(
+            self.dynamics, params.dynamics, ground, state.history, state.vehicle, command
         )
         running = state.ending == Ending.RUNNING
         apart = disagreement(history)

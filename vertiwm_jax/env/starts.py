@@ -12,6 +12,7 @@ from vertiwm_jax.dynamics import (
     Dynamics,
     History,
     Params,
+    step,
 )
 from vertiwm_jax.env import route, tasks
 from vertiwm_jax.env.episode import NavigationConfig, NavigationParams, NavigationState, see
@@ -115,43 +116,59 @@ def _settle(
 ) -> tuple[NavigationState, jax.Array]:
     """States and observations of vehicles at rest, leaves `[P, ...]` and `[P, O]`; numbers `[P]`
     are of their routes."""
-    standing = Command(jnp.float32(0), jnp.float32(0))
-    action = starts.config.action(standing)
+    model, config = starts.dynamics, starts.config
 
-    def settle(
-        dynamics: Params, terrain: TerrainMap, routes: Routes, task: Tasks, number: jax.Array
-    ) -> tuple[NavigationState, jax.Array]:
+    def standing() -> Command:
+        return Command(jnp.float32(0), jnp.float32(0))
+
+    def place(dynamics: Params, terrain: TerrainMap, task: Tasks) -> tuple[VehicleState, History]:
         selected = terrain.select(task.world)
-        vehicle = tasks.place(selected, starts.config.chassis, task.start, task.yaw)
-        goal = jnp.append(task.goal, query.height(selected, task.goal))
+        vehicle = tasks.place(selected, config.chassis, task.start, task.yaw)
+        return vehicle, model.init(dynamics, selected, vehicle)
 
-        def advance(
-            carry: tuple[VehicleState, History], _: None
-        ) -> tuple[tuple[VehicleState, History], None]:
-            vehicle, history = carry
-            return starts.dynamics.step(dynamics, selected, history, vehicle, standing), None
+    def stand(
+        dynamics: Params,
+        terrain: TerrainMap,
+        world: jax.Array,
+        placed: tuple[VehicleState, History],
+    ) -> tuple[VehicleState, History]:
+        vehicle, history = placed
+        return step(model, dynamics, terrain.select(world), history, vehicle, standing())
 
-        carry = vehicle, starts.dynamics.init(dynamics, selected, vehicle)
-        (vehicle, history), _ = jax.lax.scan(advance, carry, length=starts.config.settle_steps)
-        zero = jnp.int32(0)
+    def start(
+        terrain: TerrainMap,
+        routes: Routes,
+        task: Tasks,
+        number: jax.Array,
+        settled: tuple[VehicleState, History],
+    ) -> tuple[NavigationState, jax.Array]:
+        vehicle, history = settled
+        selected = terrain.select(task.world)
+        zero, action = jnp.int32(0), config.action(standing())
         state = NavigationState(
             time=zero,
             vehicle=vehicle,
             history=history,
             world=task.world,
-            goal=goal,
+            goal=jnp.append(task.goal, query.height(selected, task.goal)),
             route=number,
             action=action,
             stalled=zero,
             ending=zero,
             variation=Variation.draw(starts.variation, jax.random.key(0), action),
-            belief=reveal.begin(starts.config.reveal, selected, vehicle.position, vehicle.rpy[2]),
+            belief=reveal.begin(config.reveal, selected, vehicle.position, vehicle.rpy[2]),
         )
         believed = dataclasses.replace(selected, belief=state.belief)
-        return state, see(starts.config, believed, routes.select(number), state)
+        return state, see(config, believed, routes.select(number), state)
 
-    each = devices.spread(settle, (None, None, None, 0, 0))
-    return each(dynamics, terrain, routes, pool, numbers)
+    placed = devices.spread(place, (None, None, 0))(dynamics, terrain, pool)
+    # Step by step for all of them, and not all steps for each: it is traced in half the time.
+    stand_all = partial(devices.spread(stand, (None, None, 0, 0)), dynamics, terrain, pool.world)
+    settled, _ = jax.lax.scan(
+        lambda placed, _: (stand_all(placed), None), placed, length=config.settle_steps
+    )
+    start_all = devices.spread(start, (None, None, 0, 0, 0))
+    return start_all(terrain, routes, pool, numbers, settled)
 
 
 # Apart, for what is traced inside of something else, as for its shapes, has no compiler options.

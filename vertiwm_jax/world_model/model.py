@@ -225,10 +225,10 @@ class VertiWM:
     ) -> VertiWMHistory:
         """Both specialists' histories, gates without memory."""
         history = VertiWMHistory(
-            self.transformer.init(params.transformer, terrain, state),
-            self.nesam.init(params.nesam, terrain, state),
+            self.transformer.begin(params.transformer, terrain, state),
+            self.nesam.begin(params.nesam, terrain, state),
             hidden=jnp.zeros((len(params.gate), HIDDEN)),
-            coefficients=jnp.full(4, 0.5),
+            coefficients=jnp.full(4, 0.5, jnp.float32),
             disagreement=jnp.float32(0),
             spread=jnp.float32(0),
         )

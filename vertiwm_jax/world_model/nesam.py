@@ -126,10 +126,15 @@ class Nesam:
 
     def init(self, params: NesamParams, terrain: TerrainMap, state: VehicleState) -> NesamHistory:
         """The simulator's history, an empty cache and a look at the ground."""
+        begun = self.begin(params, terrain, state)
+        return replace(begun, perception=self.look(params, terrain, state))
+
+    def begin(self, params: NesamParams, terrain: TerrainMap, state: VehicleState) -> NesamHistory:
+        """`init` without the look."""
         empty = self._network.apply(params.network, (2,), method=SpecialistNetwork.empty_cache)
         cache = cast(KeyValueCache, empty) if self.residual else None
         memory = self.simulator.init(params.simulator, terrain, state)
-        return NesamHistory(memory, cache, state, self.look(params, terrain, state))
+        return NesamHistory(memory, cache, state, None)
 
     def step(
         self,

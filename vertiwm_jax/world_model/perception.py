@@ -241,6 +241,10 @@ class Specialist(Dynamics, Protocol):
         """How `history.perception` is seen by that."""
         ...
 
+    def begin(self, params: Params, terrain: TerrainMap, state: VehicleState) -> History:
+        """`init` without the look: `history.perception` is None."""
+        ...
+
     def propose(
         self,
         params: Params,

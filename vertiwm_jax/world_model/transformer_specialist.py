@@ -86,9 +86,16 @@ class TransformerSpecialist:
         self, params: TransformerParams, terrain: TerrainMap, state: VehicleState
     ) -> TransformerHistory:
         """An empty cache and a look at the ground."""
+        begun = self.begin(params, terrain, state)
+        return replace(begun, perception=self.look(params, terrain, state))
+
+    def begin(
+        self, params: TransformerParams, terrain: TerrainMap, state: VehicleState
+    ) -> TransformerHistory:
+        """`init` without the look."""
+        del terrain, state
         empty = self._network.apply(params.network, method=SpecialistNetwork.empty_cache)
-        perception = self.look(params, terrain, state)
-        return TransformerHistory(cast(KeyValueCache, empty), perception)
+        return TransformerHistory(cast(KeyValueCache, empty), None)
 
     def step(
         self,
