@@ -72,6 +72,7 @@ def report(
 ) -> None:
     """Print one row of figures per case, with the hardware, as a table or one JSON object.
 
+    A table that is too wide for the terminal is shown case by case, a line for each figure.
     also: what else the figures were measured on, beside `hardware`.
     """
     machine = hardware() | dict(also or {})
@@ -86,7 +87,14 @@ def report(
     for case, figures in results.items():
         table.add_row(case, *(cell(figures.get(column, "")) for column in columns))
     console = Console()
-    console.print(table)
+    anywhere = console.options.update(width=10_000)
+    if console.measure(table, options=anywhere).minimum <= console.width:
+        console.print(table)
+    else:
+        for case, figures in results.items():
+            print(case)
+            for column, value in figures.items():
+                print(f"    {column:<24} {cell(value)}")
     console.print(" | ".join(f"{key} {value}" for key, value in machine.items()), highlight=False)
 
 

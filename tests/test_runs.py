@@ -3,6 +3,8 @@ import itertools
 import json
 import os
 import resource
+import subprocess
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -280,3 +282,13 @@ def test_a_project_without_the_package_is_said_before_a_folder_is_made(tmp_path,
     with pytest.raises(TrackingError, match=message):
         Run.begin(Tracked(runs=tmp_path), "ppo", project="driving")
     assert not list(tmp_path.iterdir())
+
+
+def test_pytorch_is_not_imported_but_can_be(tmp_path):
+    (tmp_path / "torch.py").write_text("here = True")
+    program = (
+        "import sys, vertiwm_jax.runs; assert 'torch' not in sys.modules; "
+        "import torch; assert torch.here"
+    )
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", program], env=environment, check=True)

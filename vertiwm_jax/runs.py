@@ -18,14 +18,9 @@ from typing import Any, ClassVar, Protocol, Self
 
 import rich.progress
 from rich.console import Console
-from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto.event_pb2 import (  # generated without types
-    Event,  # pyright: ignore[reportAttributeAccessIssue]
-    SessionLog,  # pyright: ignore[reportAttributeAccessIssue]
-)
-from tensorboardX.summary import scalar
 
 from vertiwm_jax import config, hosts, tracking
+from vertiwm_jax.tensorboard import Events
 
 METRICS = "metrics.jsonl"
 
@@ -56,7 +51,7 @@ class Run:
     the run that this is a `part` of, or its own.
     """
 
-    def __init__(self, folder: Path, events: EventsWriter) -> None:
+    def __init__(self, folder: Path, events: Events) -> None:
         self.folder = folder
         self.outermost = folder
         self._events = events
@@ -87,10 +82,8 @@ class Run:
         write_atomic(folder / METRICS, "".join(json.dumps(entry) + "\n" for entry in kept))
         write_atomic(folder / "config.yaml", config.dump(settings))
         try:
-            events = _events_writer(folder)
-            restart = SessionLog(status=SessionLog.START)
-            # TensorBoard hides what earlier event files hold from this step on.
-            events.write_event(Event(wall_time=time.time(), step=step + 1, session_log=restart))
+            events = Events(folder)
+            events.restart(step + 1)
         except OSError as error:
             raise RunError(f"{folder}: cannot continue the run: {error}") from error
         return cls(folder, events)
@@ -138,7 +131,7 @@ class Run:
     def _begin(cls, folder: Path, settings: Any) -> Self:
         config.save(settings, folder / "config.yaml")
         (folder / METRICS).touch()
-        return cls(folder, _events_writer(folder))
+        return cls(folder, Events(folder))
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
         """Record scalars at `step` in `metrics.jsonl` and for TensorBoard.
@@ -151,10 +144,7 @@ class Run:
         path = self.folder / METRICS
         _append(path, json.dumps({"step": int(step), "wall_time": round(now, 3), **values}) + "\n")
         try:
-            for name, value in values.items():
-                event = Event(wall_time=now, step=int(step), summary=scalar(name, value))
-                self._events.write_event(event)
-            self._events.flush()
+            self._events.log(int(step), now, values)
         except OSError as error:
             raise RunError(f"{self.folder}: cannot write TensorBoard events: {error}") from error
         if self._tracker:
@@ -370,8 +360,3 @@ def _make_folder(root: Path, name: str) -> Path:
         folder = root / f"{name}-{number}"
     folder.mkdir(parents=True)
     return folder
-
-
-def _events_writer(folder: Path) -> EventsWriter:
-    # Written in this thread: a background writer would lose a full disk's error, then hang.
-    return EventsWriter(str(folder / "events"), filename_suffix=f".{time.time_ns()}")
