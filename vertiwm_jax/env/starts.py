@@ -119,6 +119,7 @@ def _settle(
     model, config = starts.dynamics, starts.config
 
     def standing() -> Command:
+        # Made where it is used: from outside of what devices share, it would be another type.
         return Command(jnp.float32(0), jnp.float32(0))
 
     def place(dynamics: Params, terrain: TerrainMap, task: Tasks) -> tuple[VehicleState, History]:
