@@ -41,7 +41,7 @@ class SeeingParams:
 @struct.dataclass
 class SeeingHistory:
     physics: Any
-    perception: Perception
+    perception: Perception | None
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,11 @@ class SeeingBicycle:
     bicycle: KinematicBicycle = KinematicBicycle()
 
     def init(self, params, terrain, state):
-        perception = self.look(params, terrain, state)
-        return SeeingHistory(self.bicycle.init(params.physics, terrain, state), perception)
+        begun = self.begin(params, terrain, state)
+        return replace(begun, perception=self.look(params, terrain, state))
+
+    def begin(self, params, terrain, state):
+        return SeeingHistory(self.bicycle.init(params.physics, terrain, state), None)
 
     def step(self, params, terrain, history, state, command):
         state, history = self.propose(params, terrain, history, state, command)
