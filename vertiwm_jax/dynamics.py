@@ -41,17 +41,10 @@ class Dynamics(Protocol):
     ) -> tuple[VehicleState, History]: ...
 
 
-@partial(jax.jit, static_argnames="dynamics")
-def step(
-    dynamics: Dynamics,
-    params: Params,
-    terrain: TerrainMap,
-    history: History,
-    state: VehicleState,
-    command: Command,
-) -> tuple[VehicleState, History]:
-    """`dynamics.step`, which all programs that call it like this trace only once."""
-    return dynamics.step(params, terrain, history, state, command)
+@partial(jax.jit, static_argnums=0)
+def step(dynamics: Dynamics, *given: Any) -> tuple[VehicleState, History]:
+    """`dynamics.step` of what is `given`, traced once for all programs that give the same types."""
+    return dynamics.step(*given)
 
 
 def disagreement(history: History) -> jax.Array:

@@ -1,4 +1,5 @@
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import chex
 import jax
@@ -17,10 +18,11 @@ from vertiwm_jax.env.reward import RewardConfig
 from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import Ending
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
+from vertiwm_jax.rl import task as task_of_learning
+from vertiwm_jax.rl.task import TaskConfig
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.world_model.choice import lean
-from vertiwm_jax.world_model.model import VertiWM
+from vertiwm_jax.world_model.choice import ModelName
 
 KEY = jax.random.key(0)
 AHEAD = jnp.array([1.0, 0.0])
@@ -217,18 +219,19 @@ def test_step_compiles_once_and_resets_by_itself():
     assert set(map(bytes, first)) <= set(map(bytes, np.asarray(params.start_observation)))
 
 
-def test_a_model_is_traced_once_for_starts_and_for_steps(monkeypatch):
-    model, params = VertiWM.pretrained()
-    traced, step = [], VertiWM.step
+@pytest.mark.parametrize("name", get_args(ModelName))
+def test_a_model_is_traced_once_for_starts_and_for_steps(name, monkeypatch):
+    model, params = task_of_learning.dynamics(TaskConfig(operands="float32"), name)
+    traced, step = [], type(model).step
 
     def noted(self, *args):
         traced.append(self)
         return step(self, *args)
 
-    monkeypatch.setattr(VertiWM, "step", noted)
+    monkeypatch.setattr(type(model), "step", noted)
     terrain = ground(hills())
     pool = circle_tasks(terrain, 55.0, 4)
-    env, number = NavigationEnv(lean(model)), len(pool.world)
+    env, number = NavigationEnv(model), len(pool.world)
     shapes = env.shapes(params, terrain, pool)
     mesh = devices.mesh(number)
     keys, actions = jax.random.split(KEY, number), jnp.zeros((number, 2))

@@ -8,12 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax import devices
-from vertiwm_jax.dynamics import (
-    Dynamics,
-    History,
-    Params,
-    step,
-)
+from vertiwm_jax.dynamics import Dynamics, History, Params, step
 from vertiwm_jax.env import route, tasks
 from vertiwm_jax.env.episode import NavigationConfig, NavigationParams, NavigationState, see
 from vertiwm_jax.env.route import Routes
@@ -23,6 +18,7 @@ from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query, reveal
 from vertiwm_jax.terrain.map import TerrainMap
 
+_Placed = tuple[VehicleState, History]
 _TOGETHER = 64  # vehicles on a device, of which each has patches in every step
 
 
@@ -122,26 +118,17 @@ def _settle(
         # Made where it is used: from outside of what devices share, it would be another type.
         return Command(jnp.float32(0), jnp.float32(0))
 
-    def place(dynamics: Params, terrain: TerrainMap, task: Tasks) -> tuple[VehicleState, History]:
+    def place(dynamics: Params, terrain: TerrainMap, task: Tasks) -> _Placed:
         selected = terrain.select(task.world)
         vehicle = tasks.place(selected, config.chassis, task.start, task.yaw)
         return vehicle, model.init(dynamics, selected, vehicle)
 
-    def stand(
-        dynamics: Params,
-        terrain: TerrainMap,
-        world: jax.Array,
-        placed: tuple[VehicleState, History],
-    ) -> tuple[VehicleState, History]:
+    def stand(dynamics: Params, terrain: TerrainMap, world: jax.Array, placed: _Placed) -> _Placed:
         vehicle, history = placed
         return step(model, dynamics, terrain.select(world), history, vehicle, standing())
 
     def start(
-        terrain: TerrainMap,
-        routes: Routes,
-        task: Tasks,
-        number: jax.Array,
-        settled: tuple[VehicleState, History],
+        terrain: TerrainMap, routes: Routes, task: Tasks, number: jax.Array, settled: _Placed
     ) -> tuple[NavigationState, jax.Array]:
         vehicle, history = settled
         selected = terrain.select(task.world)
@@ -163,7 +150,8 @@ def _settle(
         return state, see(config, believed, routes.select(number), state)
 
     placed = devices.spread(place, (None, None, 0))(dynamics, terrain, pool)
-    # Step by step for all of them, and not all steps for each: it is traced in half the time.
+    # Steps of all, and not all steps of each: inside of `vmap`, a scan is traced again until it is
+    # known what of a history differs between vehicles.
     stand_all = partial(devices.spread(stand, (None, None, 0, 0)), dynamics, terrain, pool.world)
     settled, _ = jax.lax.scan(
         lambda placed, _: (stand_all(placed), None), placed, length=config.settle_steps

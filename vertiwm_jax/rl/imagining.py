@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.dynamics import History, Params
+from vertiwm_jax.dynamics import History, Params, step
 from vertiwm_jax.env.driver import Driver
 from vertiwm_jax.env.episode import NavigationParams, NavigationState
 from vertiwm_jax.env.navigation import NavigationEnv
@@ -88,9 +88,8 @@ class Imagining(Driver):
         """The base, corrected as planned; the model's history follows the vehicle."""
         action = corrected(self.base, observation, key, memory.corrections[0])
         terrain, command = params.believed(state), self.env.config.command(action)
-        _, history = self.env.dynamics.step(
-            self.dynamics, terrain, memory.history, state.vehicle, command
-        )
+        given = self.dynamics, terrain, memory.history, state.vehicle, command
+        _, history = step(self.env.dynamics, *given)
         return action, replace(memory, history=history)
 
     @abstractmethod
