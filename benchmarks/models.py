@@ -1,4 +1,8 @@
-"""Steps of 0.1 s that each model takes in a second, by batch, on mixed ground, patches included."""
+"""Steps of 0.1 s that each model takes in a second, by batch, on mixed ground, patches included.
+
+On as many devices as `vertiwm_jax.devices.mesh` gives a batch: every core of a CPU is one, unless
+`JAX_NUM_CPU_DEVICES` sets another number.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks._harness import Figures, measure, parser, report
+from vertiwm_jax import devices
 from vertiwm_jax.dynamics import Params, rollout
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.mechanics.simulator import chrono_like
@@ -54,17 +59,21 @@ def rates(name: ModelName, weights: Path | None, batches: Sequence[int]) -> dict
     model, params = choose(name, weights)
     model = lean(model)
 
-    def drive(params: Params, start: VehicleState, commands: Command) -> jax.Array:
+    def drive(
+        params: Params, terrain: TerrainMap, start: VehicleState, commands: Command
+    ) -> jax.Array:
         history = model.init(params, terrain, start)
         return rollout(model, params, terrain, history, start, commands).position[-1]
 
+    many = jax.jit(devices.spread(drive, in_axes=(None, None, 0, 0)))
     results = {}
     for batch in batches:
-        terrain, starts, commands = drives(batch, STEPS)
-        many = jax.jit(jax.vmap(drive, in_axes=(None, 0, 0)))
-        figures = measure(many, params, starts, commands, repeats=3)
+        mesh = devices.mesh(batch)
+        given = devices.everywhere(mesh, (params, *drives(batch, STEPS)))
+        with jax.set_mesh(mesh):
+            figures = measure(many, *given, repeats=3)
         rate = batch * STEPS / figures["median_s"]
-        results[f"{name}, batch {batch}"] = {"steps_per_s": rate, **figures}
+        results[f"{name}, batch {batch}"] = {"steps_per_s": rate, **figures, "devices": mesh.size}
     return results
 
 

@@ -7,6 +7,7 @@ from benchmarks._harness import Figures, measure, parser, report
 from benchmarks.models import drives
 from vertiwm_jax.dynamics import Params, rollout
 from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.choice import ModelName, choose
 
 BATCHES = (1, 64)
@@ -17,7 +18,9 @@ def rates(name: ModelName, batches: tuple[int, ...]) -> dict[str, Figures]:
     """Seconds of a rollout, and of a rollout with its gradient, by batch."""
     model, params = choose(name)
 
-    def travelled(params: Params, commands: Command, starts: VehicleState) -> jax.Array:
+    def travelled(
+        params: Params, commands: Command, terrain: TerrainMap, starts: VehicleState
+    ) -> jax.Array:
         def one(start: VehicleState, command: Command) -> jax.Array:
             history = model.init(params, terrain, start)
             end = rollout(model, params, terrain, history, start, command).position[-1]
@@ -28,9 +31,10 @@ def rates(name: ModelName, batches: tuple[int, ...]) -> dict[str, Figures]:
     results = {}
     for batch in batches:
         terrain, starts, commands = drives(batch, STEPS)
-        forward = measure(jax.jit(travelled), params, commands, starts, repeats=3)
+        given = params, commands, terrain, starts
+        forward = measure(jax.jit(travelled), *given, repeats=3)
         gradient = jax.jit(jax.grad(travelled, argnums=(0, 1), allow_int=True))
-        both = measure(gradient, params, commands, starts, repeats=3)
+        both = measure(gradient, *given, repeats=3)
         results[f"{name}, batch {batch}"] = {
             "forward_s": forward["median_s"],
             "with_gradient_s": both["median_s"],

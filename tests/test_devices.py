@@ -107,20 +107,33 @@ def test_turns_give_what_all_at_once_gives(at_a_time):
     chex.assert_trees_all_equal(found, function(batch))
 
 
-@pytest.mark.parametrize(("run_by", "expected"), [("-m", 3), ("script.py", 1)])
-def test_commands_use_all_cores_and_scripts_what_they_ask_for(run_by, expected):
-    program = (
-        "import os, sys\n"
-        "os.sched_getaffinity = lambda process: {0, 1, 2}\n"
-        f"sys.argv[0] = {run_by!r}\n"
-        "import vertiwm_jax.ppo, jax\n"
-        "print(jax.device_count())\n"
-    )
+def with_three_cores(program: str) -> subprocess.CompletedProcess[str]:
+    """What a new process that has so many cores makes of a program."""
+    cores = "import os, sys; os.sched_getaffinity = lambda process: {0, 1, 2}\n"
     unset = {name: value for name, value in os.environ.items() if name != "JAX_NUM_CPU_DEVICES"}
-    found = subprocess.run(
-        [sys.executable, "-c", program], env=unset, capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, "-c", cores + program]
+    return subprocess.run(command, env=unset, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("before", "expected"),
+    [
+        ("sys.argv[0] = '-m'", 3),  # as while Python looks for a command
+        ("sys.argv[0] = 'script.py'", 1),
+        ("from vertiwm_jax import devices; devices.use_cores(); devices.use_cores()", 3),
+    ],
+)
+def test_commands_use_all_cores_and_scripts_what_they_ask_for(before, expected):
+    found = with_three_cores(f"{before}\nimport vertiwm_jax.ppo, jax\nprint(jax.device_count())\n")
     assert int(found.stdout) == expected
+
+
+def test_to_ask_for_all_cores_too_late_is_an_error_that_says_what_to_do():
+    program = "import vertiwm_jax.ppo\nfrom vertiwm_jax import devices\ndevices.use_cores()\n"
+    found = with_three_cores(program)
+    assert found.returncode == 1
+    assert "JAX has started with 1 CPU device(s) of 3. Call it before" in found.stderr
+    assert "JAX_NUM_CPU_DEVICES=3" in found.stderr
 
 
 PPO_CONFIG = PPOConfig(

@@ -21,7 +21,6 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 WITH_EXAMPLES = [
     "README.md",
     "docs/own-map.md",
-    "docs/performance.md",
     pytest.param("docs/getting-started.md", marks=pytest.mark.slow),
 ]
 

@@ -43,10 +43,11 @@ def cores() -> int:
 
 
 def use_cores() -> None:
-    """Makes every core of a CPU a device, unless JAX has started or `JAX_NUM_CPU_DEVICES` is set.
+    """Makes every core of a CPU a device, unless `JAX_NUM_CPU_DEVICES` sets their number.
 
     Two devices of one core each are faster than one of two cores, whose cores wait for each other
-    after every operation (docs/performance.md).
+    after every operation (docs/performance.md). `RuntimeError` where JAX has started already with
+    another number of them.
     """
     # Where another program takes one core, the others wait; after 60 s XLA would end the process.
     for flag in ("warn_stuck", "terminate"):
@@ -54,9 +55,18 @@ def use_cores() -> None:
         flags = os.environ.get("XLA_FLAGS", "")
         if name not in flags:
             os.environ["XLA_FLAGS"] = f"{flags} {name}={_PATIENCE}".strip()
-    if "JAX_NUM_CPU_DEVICES" not in os.environ:
-        with contextlib.suppress(RuntimeError):  # It has started: its devices are what they are.
-            jax.config.update("jax_num_cpu_devices", cores())
+    if "JAX_NUM_CPU_DEVICES" in os.environ:
+        return
+    try:
+        jax.config.update("jax_num_cpu_devices", cores())
+    except RuntimeError as error:
+        if (found := jax.local_device_count("cpu")) == cores():
+            return
+        raise RuntimeError(
+            f"use_cores: JAX has started with {found} CPU device(s) of {cores()}. Call it before "
+            "whatever starts JAX, as to import gymnax or an environment of this package does, or "
+            f"set JAX_NUM_CPU_DEVICES={cores()}"
+        ) from error
 
 
 @cache
