@@ -98,6 +98,24 @@ class Target(Probe):
 
 
 @dataclass(frozen=True)
+class Pictured(Target):
+    """Also sees a picture of 4 x 4 cells, each of which shows the number in another way."""
+
+    @staticmethod
+    def pictured(seen: jax.Array) -> jax.Array:
+        cells = jnp.arange(16.0)
+        return jnp.concatenate([seen, (1 + cells) / 4 * seen + cells], axis=-1)
+
+    def step_env(self, key, state, action, params):
+        seen, *rest = super().step_env(key, state, action, params)
+        return self.pictured(seen), *rest
+
+    def reset_env(self, key, params):
+        seen, state = super().reset_env(key, params)
+        return self.pictured(seen), state
+
+
+@dataclass(frozen=True)
 class Endless(Probe):
     """Reward 1 in every step; only the time limit stops it, and nothing seen tells the time."""
 

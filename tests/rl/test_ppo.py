@@ -5,8 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rl.probes import Constant, Delayed, Endless, ProbeParams, Sign, Target
+from rl.probes import Constant, Delayed, Endless, Pictured, ProbeParams, Sign, Target
 
+from vertiwm_jax.networks.policy import Senses
 from vertiwm_jax.rl.learned import Corrected
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 
@@ -154,6 +155,17 @@ def test_a_minibatch_in_parts_gives_the_gradient_of_the_whole():
         return state.params, metrics
 
     chex.assert_trees_all_close(learned(4), learned(1), rtol=1e-3, atol=1e-5)
+
+
+def test_what_is_learned_from_is_what_was_seen():
+    changes = {"epochs": 1, "minibatches": 1, "normalise_observations": True}
+    config = PPOConfig(**{**vars(CONFIG), **changes})
+    ppo = PPO(Pictured(), config, senses=Senses(image=(4, 4, 1)))
+    state, metrics = train(ppo, iterations=20)
+    # Ratios of probabilities are 1 if the networks are told of each transition what they had seen.
+    assert abs(metrics["kl"]) < 1e-6
+    actions = ppo.policy(ProbeParams(), state)(Pictured.pictured(jnp.array([[-1.0], [1.0]])))
+    assert np.ptp(actions) > 0.1
 
 
 @pytest.mark.parametrize("parts", [0, 3, 256])

@@ -105,6 +105,14 @@ class Senses:
     candidates: Candidates | None = None
     image: tuple[int, int, int] | None = None
 
+    @property
+    def parts(self) -> tuple[slice, ...]:
+        """What of an observation is read by itself: all of it, or the picture and what precedes."""
+        if self.image is None:
+            return (slice(None),)
+        start = -math.prod(self.image)
+        return slice(start), slice(start, None)
+
     def read(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The observation `[..., O]` without its picture, and that compressed, `[..., 16]` or none.
 
@@ -113,7 +121,7 @@ class Senses:
         if self.image is None:
             return observation, observation[..., :0]
         h, w, c = self.image
-        rest, seen = observation[..., : -h * w * c], observation[..., -h * w * c :]
+        rest, seen = (observation[..., part] for part in self.parts)
         seen = seen.reshape(*seen.shape[:-1], h * w // _TILE**2, _TILE**2 * c)
         return rest, Compressor()(seen)
 

@@ -57,6 +57,12 @@ class RunningStatistics:
             count=count,
         )
 
+    def of(self, part: slice) -> Self:
+        """Of a part of the last axis."""
+        return dataclasses.replace(
+            self, mean=self.mean[..., part], variance=self.variance[..., part]
+        )
+
     @property
     def std(self) -> jax.Array:
         """`[...]` standard deviation, never 0."""

@@ -284,10 +284,7 @@ class OffPolicy(Generic[Learner]):
         return Networks(
             self.rule.actor(actions, self.senses),
             ActionCritic(config.hidden, self.senses),
-            optax.chain(
-                optax.clip_by_global_norm(config.max_gradient_norm),
-                optax.adam(config.learning_rate),
-            ),
+            config.adam(config.learning_rate, eps=1e-8),
             config.restraint,
         )
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 from gymnax.environments.environment import Environment
+from jax.flatten_util import ravel_pytree
 
 from vertiwm_jax import devices
 from vertiwm_jax.networks.policy import Actor, Critic, Gaussian, Senses
@@ -129,8 +130,7 @@ class Transitions:
 class Batch:
     """What the loss is made of, `[T, N]` as collected, or `[B]` of them.
 
-    `observation` is not normalised, `target` a lambda return.
-    advantage: in the loss, normalised over its minibatch.
+    `target` is a lambda return; observation, advantage: in the loss, normalised.
     """
 
     observation: jax.Array
@@ -194,13 +194,13 @@ class PPO:
             batch = self._batch(state, returns, transitions)
         with jax.named_scope("update"):
             params, optimiser, losses = self._update(env_params, state, batch, update_key)
-        finite = jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), (params, losses))
+        learned, _ = ravel_pytree((params, losses))
         metrics = {
             **losses,
             **environments.episodes(experience),
             "reward": jnp.mean(experience.reward),
             "explained_variance": 1 - jnp.var(batch.target - batch.value) / jnp.var(batch.target),
-            "finite": jnp.all(jnp.stack(jax.tree.leaves(finite))),
+            "finite": jnp.all(jnp.isfinite(learned)),
         }
         state = TrainState(
             iteration=state.iteration + 1,
@@ -235,10 +235,7 @@ class PPO:
 
     @property
     def _optimiser(self) -> optax.GradientTransformation:
-        return optax.chain(
-            optax.clip_by_global_norm(self.config.max_gradient_norm),
-            optax.adam(self.config.learning_rate_schedule, eps=1e-5),
-        )
+        return self.config.adam(self.config.learning_rate_schedule, eps=1e-5)
 
     def _value(self, params: Params, observation: jax.Array) -> jax.Array:
         return cast(jax.Array, self._critic.apply(params["critic"], observation))
@@ -299,23 +296,37 @@ class PPO:
         groups = config.shareable
         batch = jax.tree.map(lambda x: x.reshape(len(x), groups, -1, *x.shape[2:]), batch)
 
-        def chosen(leaf: jax.Array, rows: jax.Array) -> jax.Array:
+        def chosen(leaf: jax.Array, rows: jax.Array, *numbers: slice) -> jax.Array:
             """Of `[T, G, N / G, ...]` the rows `[G, R]` of each group, `[G R, ...]`."""
-            of_group = jax.vmap(lambda x, row: x[*jnp.divmod(row, leaf.shape[2])], in_axes=(1, 0))
-            return devices.share(of_group(leaf, rows).reshape(-1, *leaf.shape[3:]))
+
+            def of_group(x: jax.Array, row: jax.Array) -> jax.Array:
+                return x[*jnp.divmod(row, leaf.shape[2]), *numbers]
+
+            found = jax.vmap(of_group, in_axes=(1, 0))(leaf, rows)
+            return devices.share(found.reshape(-1, *found.shape[2:]))
+
+        def seen(rows: jax.Array) -> jax.Array:
+            """Chosen observations, normalised."""
+            # Not before, and each part by itself, so that it is normalised while it is copied:
+            # copies of observations take long to write.
+            return jnp.concatenate(
+                [
+                    state.observations.of(part).normalise(chosen(batch.observation, rows, part))
+                    for part in self.senses.parts
+                ],
+                axis=-1,
+            )
 
         actor, optimiser = self._actor(env_params), self._optimiser
 
         def loss(params: Params, batch: Batch) -> tuple[jax.Array, Metrics]:
-            # Not before: copies of all observations take long to write.
-            seen = state.observations.normalise(batch.observation)
-            policy = cast(Gaussian, actor.apply(params["actor"], seen))
+            policy = cast(Gaussian, actor.apply(params["actor"], batch.observation))
             log_ratio = policy.log_prob(batch.action) - batch.log_prob
             ratio = jnp.exp(log_ratio)
             clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
             policy_loss = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
 
-            value = self._value(params, seen)
+            value = self._value(params, batch.observation)
             error = (value - batch.target) ** 2
             if config.value_clip is not None:
                 change = jnp.clip(value - batch.value, -config.value_clip, config.value_clip)
@@ -338,7 +349,8 @@ class PPO:
 
             def of_part(rows: jax.Array) -> tuple[Params, Metrics]:
                 part = jax.tree.map(lambda leaf: chosen(leaf, rows), batch)
-                part = replace(part, advantage=(part.advantage - mean) / (deviation + 1e-8))
+                advantage = (part.advantage - mean) / (deviation + 1e-8)
+                part = replace(part, observation=seen(rows), advantage=advantage)
                 return jax.grad(loss, has_aux=True)(params, part)
 
             gradients, losses = mean_in_turns(of_part, rows)

@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 
+import optax
+
 
 @dataclass(frozen=True)
 class LearningConfig:
@@ -46,3 +48,9 @@ class LearningConfig:
     def iterations(self) -> int:
         """Iterations of the whole training."""
         return math.ceil(self.transitions / self.collected)
+
+    def adam(self, rate: optax.ScalarOrSchedule, eps: float) -> optax.GradientTransformation:
+        """Adam with clipped gradients."""
+        clip = optax.clip_by_global_norm(self.max_gradient_norm)
+        # All weights as one vector, or XLA would compile the same for each of them.
+        return optax.flatten(optax.chain(clip, optax.adam(rate, eps=eps)))
