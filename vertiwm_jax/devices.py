@@ -225,23 +225,32 @@ def spread(
 
             return jax.lax.map(of_one, mapped, batch_size=together)
 
-        if shares > 1:
-            places = PartitionSpec(), PartitionSpec(AXIS)
-            of_device = jax.shard_map(
-                of_device,
-                in_specs=tuple(places[axis == 0] for axis in in_axes),
-                out_specs=places[1],
-                check_vma=False,
-            )
+        of_all = split(of_device, in_axes)
         if len(rows) == size:
-            return of_device(*args)
+            return of_all(*args)
         filled = [
             arg if axis is None else jax.tree.map(lambda x: x[rows], arg)
             for arg, axis in zip(args, in_axes, strict=True)
         ]
-        return jax.tree.map(lambda x: x[:size], of_device(*filled))
+        return jax.tree.map(lambda x: x[:size], of_all(*filled))
 
     return of_batch
+
+
+def split(function: Callable[..., Any], in_axes: Sequence[int | None]) -> Callable[..., Any]:
+    """A function of batches, which each device calls with its share of the rows; they divide it.
+
+    in_axes: as for `spread`.
+    """
+    if number() == 1:
+        return function
+    places = PartitionSpec(), PartitionSpec(AXIS)
+    return jax.shard_map(
+        function,
+        in_specs=tuple(places[axis == 0] for axis in in_axes),
+        out_specs=places[1],
+        check_vma=False,
+    )
 
 
 def share(tree: T) -> T:

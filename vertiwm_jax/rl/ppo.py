@@ -117,7 +117,7 @@ class Transitions:
     """Steps as collected, `[T, N]`, and what the networks of that time made of them.
 
     log_prob: of the actions, which are not clipped; value, next_value: of what was seen before and
-        after the step.
+        after the step, unless an episode has terminated.
     """
 
     experience: Experience
@@ -255,11 +255,29 @@ class PPO:
                 self.env, env_params, self.outcomes, config.discount, running, action, step_key
             )
             value = self._value(state.params, seen)
-            next_value = self._value(state.params, state.observations.normalise(final))
-            return running, Transitions(experience, policy.log_prob(action), value, next_value)
+            last = value_of_last(state.params, state.observations, final, experience.truncated)
+            return running, Transitions(experience, policy.log_prob(action), value, last)
 
+        def value_of(params: Params, known: RunningStatistics, seen: jax.Array) -> jax.Array:
+            return self._value(params, known.normalise(seen))
+
+        def if_any_truncated(
+            params: Params, known: RunningStatistics, final: jax.Array, truncated: jax.Array
+        ) -> jax.Array:
+            def none(*_: Any) -> jax.Array:
+                return jnp.zeros(len(final))
+
+            return jax.lax.cond(jnp.any(truncated), value_of, none, params, known, final)
+
+        # They are few; all others are valued one step later. Devices need not wait for each other.
+        value_of_last = devices.split(if_any_truncated, (None, None, 0, 0))
         keys = jax.random.split(key, self.config.num_steps)
-        return jax.lax.scan(advance, state.environments, keys)
+        running, transitions = jax.lax.scan(advance, state.environments, keys)
+        following = value_of(state.params, state.observations, running.observation)
+        following = jnp.concatenate([transitions.value[1:], following[None]])
+        done = transitions.experience.done
+        next_value = jnp.where(done, transitions.next_value, following)
+        return running, replace(transitions, next_value=next_value)
 
     def _batch(
         self, state: TrainState, returns: RunningStatistics, transitions: Transitions
