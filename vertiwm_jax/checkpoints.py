@@ -74,7 +74,8 @@ def load(path: str | Path, like: State) -> State:
     """
     path = Path(path).absolute()
     leaves = _flatten(like)
-    stored = jax.eval_shape(hosts.without_keys, leaves)
+    shapes = jax.eval_shape(hosts.without_keys, leaves)
+    stored = {name: shapes[name] for name in leaves}  # in their order
     this = jax.process_index()
     alone = ocp.options.MultiprocessingOptions(primary_host=this, active_processes={this})
     try:
