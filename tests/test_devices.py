@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rl.probes import ProbeParams, Target
+from rl.probes import ProbeParams, Staggered, Target
 
 from vertiwm_jax import devices
 from vertiwm_jax.learning import dataset
@@ -144,6 +144,7 @@ SAC_CONFIG = SACConfig(
 )
 ALGORITHMS = {
     "ppo": PPO(Target(), PPO_CONFIG),
+    "ppo, some cut off": PPO(Staggered(), PPO_CONFIG),
     "sac": OffPolicy(Target(), SAC(SAC_CONFIG)),
 }
 
@@ -153,12 +154,13 @@ ALGORITHMS = {
 def test_training_on_two_devices_is_training_on_one(two, name, seeds):
     algorithm = Seeds(ALGORITHMS[name], seeds)
     assert algorithm.algorithm.config.shareable == 16
-    start = jax.jit(algorithm.init)(ProbeParams(), jax.random.key(0))
+    params = ProbeParams(max_steps_in_episode=20)
+    start = jax.jit(algorithm.init)(params, jax.random.key(0))
 
     def train(mesh):
         state = start
         for _ in range(2):
-            state, metrics = devices_of(mesh, algorithm.iterate, ProbeParams(), state)
+            state, metrics = devices_of(mesh, algorithm.iterate, params, state)
         return jax.device_get((jax.tree.map(random_bits, state), metrics))
 
     chex.assert_trees_all_close(train(two), train(devices.mesh(1)), rtol=2e-4, atol=2e-5)

@@ -15,6 +15,7 @@ from typing import Any, Protocol, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
 from vertiwm_jax import checkpoints, devices, hosts
@@ -110,6 +111,12 @@ def mean_in_turns(function: Callable[[Any], State], batches: Any) -> State:
         lambda total, batch: (jax.tree.map(jnp.add, total, function(batch)), None), nothing, batches
     )
     return jax.tree.map(lambda x: x / number, total)
+
+
+def all_finite(tree: Any) -> jax.Array:
+    """`[]` whether all numbers of a pytree are finite."""
+    # As one vector, or XLA would compile the same for each leaf.
+    return jnp.all(jnp.isfinite(ravel_pytree(tree)[0]))
 
 
 def keep_compiled(folder: Path | None) -> None:

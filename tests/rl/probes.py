@@ -127,6 +127,15 @@ class Endless(Probe):
 
 
 @dataclass(frozen=True)
+class Staggered(Endless):
+    """Its episodes begin up to four steps late, so that they are cut off at different times."""
+
+    def reset_env(self, key, params):
+        seen, state = super().reset_env(key, params)
+        return seen, state.replace(time=jax.random.randint(key, (), 0, 5))
+
+
+@dataclass(frozen=True)
 class Broken(Probe):
     """Gives a reward that is not a number from the 40th step on."""
 

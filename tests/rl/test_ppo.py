@@ -5,7 +5,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rl.probes import Constant, Delayed, Endless, Pictured, ProbeParams, Sign, Target
+from rl.probes import (
+    Constant,
+    Delayed,
+    Endless,
+    Pictured,
+    ProbeParams,
+    Sign,
+    Staggered,
+    Target,
+)
 
 from vertiwm_jax.networks.policy import Senses
 from vertiwm_jax.rl.learned import Corrected
@@ -91,6 +100,10 @@ def test_truncation_is_bootstrapped_and_termination_is_not():
     state, metrics = train(endless, ProbeParams(max_steps_in_episode=5))
     assert float(metrics["episode_length"]) == 5
     np.testing.assert_allclose(values(endless, state, 0.0), 1 / (1 - 0.9), rtol=0.03)
+
+    staggered = PPO(Staggered(), CONFIG)
+    state, _ = train(staggered, ProbeParams(max_steps_in_episode=9))
+    np.testing.assert_allclose(values(staggered, state, 0.0), 1 / (1 - 0.9), rtol=0.03)
 
     finite = PPO(Constant(steps=2), CONFIG)
     state, _ = train(finite)

@@ -22,6 +22,7 @@ from vertiwm_jax.rl.learned import MeanAction, TwinValue
 from vertiwm_jax.rl.normalise import RunningStatistics
 from vertiwm_jax.rl.replay import Replay
 from vertiwm_jax.rl.settings import LearningConfig
+from vertiwm_jax.training import all_finite
 
 Params = Any
 
@@ -258,12 +259,11 @@ class OffPolicy(Generic[Learner]):
             return state, (experience, losses)
 
         state, (experience, losses) = jax.lax.scan(advance, state, keys)
-        finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state.learner)]
         metrics = {
             **jax.tree.map(jnp.nanmean, losses),
             **environments.episodes(experience),
             "reward": jnp.mean(experience.reward),
-            "finite": jnp.all(jnp.stack(finite)),
+            "finite": all_finite(state.learner),
         }
         return replace(state, iteration=state.iteration + 1, key=key), metrics
 

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 from gymnax.environments.environment import Environment
-from jax.flatten_util import ravel_pytree
 
 from vertiwm_jax import devices
 from vertiwm_jax.networks.policy import Actor, Critic, Gaussian, Senses
@@ -25,7 +24,7 @@ from vertiwm_jax.rl.environments import Environments, Experience, Metrics, Outco
 from vertiwm_jax.rl.learned import MeanAction, Value
 from vertiwm_jax.rl.normalise import RunningStatistics
 from vertiwm_jax.rl.settings import LearningConfig
-from vertiwm_jax.training import mean_in_turns
+from vertiwm_jax.training import all_finite, mean_in_turns
 
 Params = Any
 
@@ -194,13 +193,12 @@ class PPO:
             batch = self._batch(state, returns, transitions)
         with jax.named_scope("update"):
             params, optimiser, losses = self._update(env_params, state, batch, update_key)
-        learned, _ = ravel_pytree((params, losses))
         metrics = {
             **losses,
             **environments.episodes(experience),
             "reward": jnp.mean(experience.reward),
             "explained_variance": 1 - jnp.var(batch.target - batch.value) / jnp.var(batch.target),
-            "finite": jnp.all(jnp.isfinite(learned)),
+            "finite": all_finite((params, losses)),
         }
         state = TrainState(
             iteration=state.iteration + 1,
@@ -255,25 +253,19 @@ class PPO:
                 self.env, env_params, self.outcomes, config.discount, running, action, step_key
             )
             value = self._value(state.params, seen)
-            last = value_of_last(state.params, state.observations, final, experience.truncated)
+            last = value_of_last(value_of, final, experience.truncated)
             return running, Transitions(experience, policy.log_prob(action), value, last)
 
-        def value_of(params: Params, known: RunningStatistics, seen: jax.Array) -> jax.Array:
-            return self._value(params, known.normalise(seen))
+        def if_any_truncated(value: Value, final: jax.Array, truncated: jax.Array) -> jax.Array:
+            zeros = jnp.zeros(len(final))
+            return jax.lax.cond(jnp.any(truncated), lambda: value(final), lambda: zeros)
 
-        def if_any_truncated(
-            params: Params, known: RunningStatistics, final: jax.Array, truncated: jax.Array
-        ) -> jax.Array:
-            def none(*_: Any) -> jax.Array:
-                return jnp.zeros(len(final))
-
-            return jax.lax.cond(jnp.any(truncated), value_of, none, params, known, final)
-
+        value_of = replace(self.value(env_params, state), scale=jnp.float32(1))
         # They are few; all others are valued one step later. Devices need not wait for each other.
-        value_of_last = devices.split(if_any_truncated, (None, None, 0, 0))
+        value_of_last = devices.split(if_any_truncated, (None, 0, 0))
         keys = jax.random.split(key, self.config.num_steps)
         running, transitions = jax.lax.scan(advance, state.environments, keys)
-        following = value_of(state.params, state.observations, running.observation)
+        following = value_of(running.observation)
         following = jnp.concatenate([transitions.value[1:], following[None]])
         done = transitions.experience.done
         next_value = jnp.where(done, transitions.next_value, following)
