@@ -3,19 +3,24 @@ import signal
 
 # The suite is a statement about the CPU in float32; before anything imports jax.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# Compiling is most of what the tests do, and three times as fast without optimisation. To test what
-# users run, set XLA_FLAGS to nothing.
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
-    "--xla_cpu_use_fusion_emitters=false",
-)
-
 # So that what is shared out to devices is, also where a worker has one core.
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")
 
 import jax
 import pytest
+
+from vertiwm_jax import xla
+
+# Compiling is most of what the tests do, and three times as fast without optimisation. To test what
+# users run, set XLA_FLAGS to nothing.
+if "XLA_FLAGS" not in os.environ:
+    xla.add_flags(
+        {
+            "xla_backend_optimization_level": 0,
+            "xla_llvm_disable_expensive_passes": "true",
+            "xla_cpu_use_fusion_emitters": "false",
+        }
+    )
 
 # One core for each of several workers. With more threads results may differ from call to call
 # (jax-ml/jax#39741), and workers only get in each other's way.

@@ -177,12 +177,28 @@ def test_a_bad_command_line_ends_with_status_2(tmp_path, capsys, argv, words):
         assert word in text
 
 
+def test_only_verbose_tells_which_compiler_options_are_left_out(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(config.xla, "left_out", lambda: ["xla_of_another_version"])
+    default = write(tmp_path, "name: x")
+    assert config.parse(Task, default, []) == config.parse(Task, default, ["--verbose"])
+    assert capsys.readouterr().out == "compiler options left out: xla_of_another_version\n"
+
+
 def test_help_names_every_field(tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         config.parse(Task, write(tmp_path, "name: x\nseed: 41"), ["--help"], prog="door")
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    options = ["--config", "--name", "--seed", "--suite", "--folder", "--layers", "--speeds"]
+    options = [
+        "--config",
+        "--verbose",
+        "--name",
+        "--seed",
+        "--suite",
+        "--folder",
+        "--layers",
+        "--speeds",
+    ]
     options += ["--optimizer.learning-rate", "--optimizer.clip", "--optimizer.anneal"]
     for word in [*options, "Train something.", "Step size.", "41"]:
         assert word in text

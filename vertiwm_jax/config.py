@@ -31,6 +31,8 @@ import numpy as np
 import tyro
 import yaml
 
+from vertiwm_jax import xla
+
 T = TypeVar("T")
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -97,7 +99,7 @@ def parse(
     argv: Sequence[str] | None = None,
     prog: str | None = None,
 ) -> T:
-    """Read a command line: `[--config FILE] [--any.field VALUE]`.
+    """Read a command line: `[--config FILE] [--any.field VALUE] [--verbose]`.
 
     `--config` replaces `default_file`; every field can then be set by its dotted name, with
     dashes or underscores. `argv` defaults to the process's arguments, `prog` to its name. Bad
@@ -112,25 +114,30 @@ def parse(
         config = load(cls, file)
     except ConfigError as error:
         first.exit(2, f"{first.prog}: error: {error}\n")
-    help_ = "YAML file that gives the fields below their values."
-    # tyro sees the file as one more option, so that the help shows it.
+    file_help = "YAML file that gives the fields below their values."
+    verbose_help = "Say which options of the compiler are left out, as it does not know them."
+    # tyro sees these as options like others, so that the help shows them.
     command_line = dataclasses.make_dataclass(
         "CommandLine",
         [
-            ("config", Annotated[Path, tyro.conf.arg(help=help_)], file),
-            ("fields", Annotated[cls, tyro.conf.arg(name="")], config),
+            ("config", Annotated[Path, tyro.conf.arg(help=file_help)], file),
+            ("verbose", Annotated[bool, tyro.conf.arg(help=verbose_help)], False),
+            ("fields", tyro.conf.FlagConversionOff[Annotated[cls, tyro.conf.arg(name="")]], config),
         ],
     )
     try:
-        return tyro.cli(
+        given = tyro.cli(
             command_line,
             args=argv,
             prog=prog,
             description=inspect.getdoc(cls),
-            config=(tyro.conf.AvoidSubcommands, tyro.conf.FlagConversionOff),
-        ).fields
+            config=(tyro.conf.AvoidSubcommands, tyro.conf.FlagCreatePairsOff),
+        )
     except ValueError as error:  # tyro lets through what the outermost dataclass refuses
         first.exit(2, f"{first.prog}: error: {error}\n")
+    if given.verbose:
+        print(f"compiler options left out: {', '.join(xla.left_out()) or 'none'}", flush=True)
+    return given.fields
 
 
 def parse_resumable(cls: type[T], name: str, argv: Sequence[str] | None, program: str) -> T:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from vertiwm_jax import hosts
+from vertiwm_jax import hosts, xla
 
 T = TypeVar("T")
 
@@ -26,11 +26,6 @@ AXIS = "devices"
 """The axis of the mesh."""
 FEWEST = 4
 """Rows of a batch that are worth a device of their own."""
-BRIEF = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-"""Compiler options of programs that run only briefly: they compile in about half the time.
-
-Loops that depend on vector units run many times slower.
-"""
 _PATIENCE = 7 * 24 * 3600  # seconds
 _WORTH_ROUNDING = 0.75  # of the time; 0.55 was measured with AVX512_BF16, above 1.5 without
 
@@ -50,11 +45,10 @@ def use_cores() -> None:
     another number of them.
     """
     # Where another program takes one core, the others wait; after 60 s XLA would end the process.
-    for flag in ("warn_stuck", "terminate"):
-        name = f"--xla_cpu_collective_call_{flag}_timeout_seconds"
-        flags = os.environ.get("XLA_FLAGS", "")
-        if name not in flags:
-            os.environ["XLA_FLAGS"] = f"{flags} {name}={_PATIENCE}".strip()
+    limits = ("warn_stuck", "terminate")
+    xla.add_flags(
+        {f"xla_cpu_collective_call_{limit}_timeout_seconds": _PATIENCE for limit in limits}
+    )
     if "JAX_NUM_CPU_DEVICES" in os.environ:
         return
     try:
@@ -242,15 +236,36 @@ def split(function: Callable[..., Any], in_axes: Sequence[int | None]) -> Callab
 
     in_axes: as for `spread`.
     """
-    if number() == 1:
+    shares = number()
+    if shares == 1:
         return function
-    places = PartitionSpec(), PartitionSpec(AXIS)
-    return jax.shard_map(
-        function,
-        in_specs=tuple(places[axis == 0] for axis in in_axes),
-        out_specs=places[1],
-        check_vma=False,
-    )
+    places = tuple(PartitionSpec(AXIS) if axis == 0 else PartitionSpec() for axis in in_axes)
+
+    def of_batch(*args: Any) -> Any:
+        # Arrays without elements are made where they are used: as operands of `shard_map` they end
+        # jaxlib 0.11 in a segmentation fault (Shardy's ManualComputationUnusedInputsPattern).
+        filled = jax.tree.map(lambda x: x if np.size(x) else None, args)
+
+        def of_share(*given: Any) -> Any:
+            rows = [shares if axis == 0 else 1 for axis in in_axes]
+            return function(*map(_with_empty, given, args, rows))
+
+        return jax.shard_map(
+            of_share, in_specs=places, out_specs=PartitionSpec(AXIS), check_vma=False
+        )(*filled)
+
+    return of_batch
+
+
+def _with_empty(given: T, whole: T, shares: int) -> T:
+    """Leaves `[B / shares, ...]`, with those that `whole`, `[B, ...]`, has without elements."""
+
+    def leaf(given: Any, whole: Any) -> Any:
+        if given is not None or whole is None:
+            return given
+        return jnp.zeros((len(whole) // shares, *whole.shape[1:]), whole.dtype)
+
+    return jax.tree.map(leaf, given, whole, is_leaf=lambda x: x is None)
 
 
 def share(tree: T) -> T:

@@ -18,7 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
-from vertiwm_jax import checkpoints, devices, hosts
+from vertiwm_jax import checkpoints, devices, hosts, xla
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.runs import Run, RunError
 from vertiwm_jax.tracking import TrackingError
@@ -155,8 +155,8 @@ def compiled(algorithm: Algorithm[State], data: Any, batch: int) -> Any:
 
 def begin(algorithm: Algorithm[State], data: Any, key: jax.Array) -> State:
     """The state before the first iteration."""
-    options = devices.BRIEF | {"xla_backend_optimization_level": 0}  # It runs only once.
-    return jax.jit(algorithm.init, compiler_options=options)(data, key)
+    once = {"xla_backend_optimization_level": 0}
+    return xla.brief_jit(algorithm.init, compiler_options=once)(data, key)
 
 
 def train(

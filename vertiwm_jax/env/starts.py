@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax import devices
+from vertiwm_jax import devices, xla
 from vertiwm_jax.dynamics import Dynamics, History, Params, step
 from vertiwm_jax.env import route, tasks
 from vertiwm_jax.env.episode import NavigationConfig, NavigationParams, NavigationState, see
@@ -161,4 +161,4 @@ def _settle(
 
 
 # Apart, for what is traced inside of something else, as for its shapes, has no compiler options.
-_settle_once = jax.jit(_settle, static_argnames="starts", compiler_options=devices.BRIEF)
+_settle_once = xla.brief_jit(_settle, static_argnames="starts")

@@ -1,6 +1,7 @@
 """Navigation tasks: where a vehicle starts, which way it looks, and where it must go."""
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax import devices
+from vertiwm_jax import xla
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.geometry import wrap
@@ -79,7 +80,7 @@ def circle_tasks(
     return _across(terrain, half * np.array([1, -1]), radius, pairs, sway)
 
 
-@jax.jit(static_argnames=("radius", "pairs", "sway"), compiler_options=devices.BRIEF)
+@functools.partial(xla.brief_jit, static_argnames=("radius", "pairs", "sway"))
 def _across(terrain: TerrainMap, half: jax.Array, radius: float, pairs: int, sway: float) -> Tasks:
     """Tasks across circles about the places that lie `half` m from the corners of all worlds."""
     middle = terrain.origin + half
@@ -137,7 +138,7 @@ def random_tasks(
     return tasks
 
 
-@jax.jit(static_argnames=("count", "chassis", "config"), compiler_options=devices.BRIEF)
+@functools.partial(xla.brief_jit, static_argnames=("count", "chassis", "config"))
 def _draw(
     key: jax.Array, terrain: TerrainMap, count: int, chassis: Chassis, config: RandomTaskConfig
 ) -> tuple[Tasks, jax.Array]:

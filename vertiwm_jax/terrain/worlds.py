@@ -4,6 +4,7 @@ The scale is Verti-Bench's: 128 m x 128 m, one vertex a metre, 8 m class cells, 
 difficulty with the median slope of its low, mid and high worlds, and one beyond.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import cycle, islice, product
@@ -13,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax import devices
+from vertiwm_jax import xla
 from vertiwm_jax.terrain.classes import FIRST_DEFORMABLE, FRICTION_LIMITS, STANDARD
 from vertiwm_jax.terrain.map import ELEVATION_RANGE, TerrainMap
 from vertiwm_jax.terrain.soil import enlarged
@@ -147,7 +148,7 @@ def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> Terrai
     )
 
 
-@jax.jit(static_argnames="relief", compiler_options=devices.BRIEF)
+@functools.partial(xla.brief_jit, static_argnames="relief")
 def _ground(
     key: jax.Array, slope_deg: jax.Array, kind: jax.Array, relief: ReliefConfig
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -273,7 +274,7 @@ def _friction(key: jax.Array, semantic: jax.Array) -> jax.Array:
     return jnp.where(semantic < FIRST_DEFORMABLE, jnp.clip(drawn, *FRICTION_LIMITS), 0.0)
 
 
-@jax.jit(static_argnames=("rocks", "trees"), compiler_options=devices.BRIEF)
+@functools.partial(xla.brief_jit, static_argnames=("rocks", "trees"))
 def _obstacles(key: jax.Array, rocks: int, trees: int, obstructed: float) -> jax.Array:
     """`[rocks + trees, 5]` boxes anywhere on the map but near the circle of starts and goals.
 

@@ -1,0 +1,62 @@
+"""Options that the installed XLA does not know are left out and told, and never end a process."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from vertiwm_jax import xla
+
+KNOWN, UNKNOWN = "xla_backend_optimization_level", "xla_no_such_option"
+
+
+@pytest.fixture(autouse=True)
+def _forget(monkeypatch):
+    monkeypatch.setattr(xla, "_left_out", set())
+    xla._brief_options.cache_clear()
+    yield
+    xla._brief_options.cache_clear()
+
+
+def test_flags_that_xla_does_not_know_are_left_out(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=1")
+    xla.add_flags({KNOWN: 1, UNKNOWN: 1, "xla_force_host_platform_device_count": 2})
+    assert os.environ["XLA_FLAGS"] == f"--xla_force_host_platform_device_count=1 --{KNOWN}=1"
+    assert UNKNOWN in xla.left_out() and KNOWN not in xla.left_out()
+
+
+def test_flags_that_stand_there_are_not_tried_again(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", f"--{KNOWN}=1")
+    monkeypatch.setattr(xla, "_accepts", lambda flags: pytest.fail("another process was started"))
+    xla.add_flags({KNOWN: 2})
+    assert os.environ["XLA_FLAGS"] == f"--{KNOWN}=1"
+
+
+def test_an_unknown_flag_ends_a_process_and_so_has_to_be_tried():
+    environment = {**os.environ, "XLA_FLAGS": f"--{UNKNOWN}=1"}
+    command = [sys.executable, "-c", "import jax; jax.devices()"]
+    assert subprocess.run(command, env=environment, capture_output=True).returncode != 0
+
+
+def test_compiler_options_that_xla_does_not_know_are_left_out(monkeypatch):
+    monkeypatch.setattr(xla, "_BRIEF", {KNOWN: 1, UNKNOWN: 1})
+    calls = []
+
+    def doubled(x):
+        calls.append(x)
+        return 2 * x
+
+    brief = xla.brief_jit(doubled)
+    assert [float(brief(jnp.float32(x))) for x in (1, 2)] == [2, 4] and len(calls) == 1
+    assert xla.left_out() == [UNKNOWN]
+    with pytest.raises(jax.errors.JaxRuntimeError, match=UNKNOWN):
+        jax.jit(doubled, compiler_options={UNKNOWN: 1})(jnp.float32(1))
+
+
+def test_a_program_of_ones_own_options_keeps_them():
+    brief = xla.brief_jit(jnp.sin, compiler_options={UNKNOWN: 1})
+    with pytest.raises(jax.errors.JaxRuntimeError, match=UNKNOWN):
+        brief(jnp.float32(1))
