@@ -56,6 +56,17 @@ def test_a_spread_function_gives_what_vmap_gives(two, size, at_a_time):
     chex.assert_trees_all_close(devices_of(two, spread, 2.0, x, y), expected, rtol=1e-6)
 
 
+def test_arrays_without_elements_are_spread_too(two):
+    """As obstacles on maps that have none."""
+
+    def function(all_, each, x):
+        return x + all_.shape[0] + each.shape[0] + all_.sum() + each.sum()
+
+    args = jnp.zeros((3, 0)), jnp.zeros((8, 2, 0), jnp.int32), jnp.arange(8.0)
+    given = devices_of(two, devices.spread(function, (None, 0, 0)), *args)
+    chex.assert_trees_all_close(given, jnp.arange(8.0) + 5)
+
+
 @pytest.mark.parametrize(("half", "faster"), [(0.55, True), (0.9, False), (1.6, False)])
 def test_bfloat16_has_to_be_clearly_faster(half, faster, monkeypatch):
     monkeypatch.setattr(devices, "_seconds_of_matmul", lambda *_: [1.0, half])

@@ -19,7 +19,7 @@ from vertiwm_jax.ppo import PPOTraining
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 WITH_EXAMPLES = [
-    "README.md",
+    pytest.param("README.md", marks=pytest.mark.smoke),
     "docs/own-map.md",
     pytest.param("docs/getting-started.md", marks=pytest.mark.slow),
 ]

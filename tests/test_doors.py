@@ -76,6 +76,7 @@ def learned(run):
     return policy_training.learned(config, task.held_out(config), run)
 
 
+@pytest.mark.smoke
 def test_a_run_leaves_all_that_was_promised(run, folder):
     left = {path.name.split(".tfevents")[0] for path in run.iterdir()}
     assert left >= {
@@ -100,6 +101,7 @@ def test_a_run_leaves_all_that_was_promised(run, folder):
     assert configuration.load(PPOTraining, run / "config.yaml").ppo == asked.ppo
 
 
+@pytest.mark.smoke
 def test_resuming_is_as_if_never_stopped(run, train, monkeypatch):
     log = Run.log
 

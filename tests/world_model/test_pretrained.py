@@ -26,6 +26,7 @@ RECORDED = {"rigid": 0.0534, "deformable": 0.0918, "transition": 0.1121}
 """Position errors of Verti-WM after 16 steps, m."""
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("operands", ["float32", "bfloat16"])
 def test_it_predicts_as_it_always_did(windows, operands):
     """So that what is changed for speed leaves predictions what they are, to rounding."""
