@@ -1,0 +1,92 @@
+"""CASE...: which kinds of floating-point numbers each case is computed in, as JSON.
+
+For a process with JAX_ENABLE_X64 set. What cannot be traced is told by its error.
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import gymnax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from env.worlds import GRASS, bicycle_env, ground
+
+import vertiwm_jax.env.gymnax  # Registers the task.
+from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.dynamics import Dynamics, rollout
+from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.tasks import circle_tasks
+from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of, rest_on_ground
+from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.rl.off_policy import OffPolicy
+from vertiwm_jax.rl.ppo import PPO, PPOConfig
+from vertiwm_jax.rl.sac import SAC, SACConfig
+from vertiwm_jax.rl.td3 import TD3, TD3Config
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain import worlds
+from vertiwm_jax.world_model.model import VertiWM
+
+COLLECTED = {"transitions": 64, "num_envs": 8, "num_steps": 8, "hidden": (8,)}
+REPLAYED = COLLECTED | {"updates": 1, "batch": 8, "capacity": 64, "warm_up": 64}
+
+
+def drive(model: Dynamics, params: Any) -> VehicleState:
+    """Half a second as the README drives, without compiling it."""
+    terrain = terrain_map.build(np.zeros((41, 41)), np.full((4, 4), GRASS))
+    vehicle = hmmwv()
+    position, rpy = rest_on_ground(
+        terrain,
+        jnp.zeros(2),
+        jnp.float32(0),
+        vehicle.wheelbase,
+        vehicle.track,
+        vehicle.wheel_radius,
+    )
+    start = VehicleState(position, rpy, jnp.zeros(3), jnp.zeros(3))
+    commands = Command(jnp.full(5, 3.0), jnp.full(5, 0.1))
+    return jax.eval_shape(
+        lambda params: rollout(
+            model, params, terrain, model.init(params, terrain, start), start, commands
+        ),
+        params,
+    )
+
+
+def learn(algorithm: Callable[[NavigationEnv], Any]) -> Any:
+    """An iteration of a training in the bicycle."""
+    terrain = ground()
+    env, params = bicycle_env(terrain, circle_tasks(terrain, pairs=1))
+    made = algorithm(env)
+    state = jax.eval_shape(made.init, params, jax.random.key(0))
+    return jax.eval_shape(made.iterate, params, state)
+
+
+CASES = {
+    "worlds": lambda: worlds.generate(jax.random.split(jax.random.key(0), 1), worlds.WorldConfig()),
+    "bicycle": lambda: drive(KinematicBicycle(), bicycle_of(hmmwv())),
+    "simulator": lambda: drive(Simulator(), chrono_like(hmmwv())),
+    "shipped weights": lambda: drive(*VertiWM.pretrained()),
+    "gymnax": lambda: gymnax.make(vertiwm_jax.env.gymnax.NAME, model="builtin", number=1, starts=4)[
+        1
+    ],
+    "ppo": lambda: learn(lambda env: PPO(env, PPOConfig(**COLLECTED, minibatches=2, epochs=1))),
+    "sac": lambda: learn(lambda env: OffPolicy(env, SAC(SACConfig(**REPLAYED)))),
+    "td3": lambda: learn(lambda env: OffPolicy(env, TD3(TD3Config(**REPLAYED)))),
+}
+
+
+def computed_in(case: Callable[[], Any]) -> list[str]:
+    try:
+        leaves = jax.tree.leaves(case())
+    except (TypeError, CheckpointError) as error:
+        return [f"{type(error).__name__}: {' '.join(str(error).split())}"]
+    return sorted({str(x.dtype) for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)})
+
+
+if __name__ == "__main__":
+    print(json.dumps({name: computed_in(CASES[name]) for name in sys.argv[1:]}))
