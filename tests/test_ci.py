@@ -1,4 +1,4 @@
-"""`.ci/run` fails, and says why in its last line, where tests were lost or where there were none."""
+"""`.ci/run` fails, and says why in its last line, where tests died, failed or did not run."""
 
 import os
 import subprocess
