@@ -4,7 +4,7 @@ On as many devices as `vertiwm_jax.devices.mesh` gives a batch: every core of a 
 `JAX_NUM_CPU_DEVICES` sets another number.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import get_args
 
@@ -54,17 +54,25 @@ def untrained() -> tuple[VertiWM, VertiWMParams]:
     return PAPER.build(), PAPER.init_params(jax.random.key(0), chrono_like(hmmwv()))
 
 
-def rates(name: ModelName, weights: Path | None, batches: Sequence[int]) -> dict[str, Figures]:
-    """Steps a second of one model, by batch."""
+def driving(
+    name: ModelName, weights: Path | None = None
+) -> tuple[Callable[..., VehicleState], Params]:
+    """Where one model drives, leaves `[T, 3]`, as a function; and its parameters."""
     model, params = choose(name, weights)
     model = lean(model)
 
     def drive(
         params: Params, terrain: TerrainMap, start: VehicleState, commands: Command
-    ) -> jax.Array:
+    ) -> VehicleState:
         history = model.init(params, terrain, start)
-        return rollout(model, params, terrain, history, start, commands).position[-1]
+        return rollout(model, params, terrain, history, start, commands)
 
+    return drive, params
+
+
+def rates(name: ModelName, weights: Path | None, batches: Sequence[int]) -> dict[str, Figures]:
+    """Steps a second of one model, by batch."""
+    drive, params = driving(name, weights)
     many = jax.jit(devices.spread(drive, in_axes=(None, None, 0, 0)))
     results = {}
     for batch in batches:

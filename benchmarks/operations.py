@@ -40,13 +40,20 @@ def recorded(compiled: Any, arguments: tuple[Any, ...]) -> dict[str, tuple[float
             for _ in range(_CALLS):
                 jax.block_until_ready(compiled(*arguments))
         (file,) = Path(folder).rglob("*.xplane.pb")
-        profile = jax.profiler.ProfileData.from_file(str(file))
+        return by_name(file)
+
+
+def by_name(trace: Path) -> dict[str, tuple[float, int]]:
+    """Nanoseconds of all that was recorded, and how often, by name; of a GPU only its own work."""
+    profile = jax.profiler.ProfileData.from_file(str(trace))
+    lines = [line for plane in profile.planes for line in plane.lines]
+    if any(plane.name.startswith("/device:GPU") for plane in profile.planes):
+        lines = [line for line in lines if line.name.startswith("Stream")]
     spent, calls = defaultdict[str, float](float), defaultdict[str, int](int)
-    for plane in profile.planes:
-        for line in plane.lines:
-            for event in line.events:
-                spent[event.name] += event.duration_ns
-                calls[event.name] += 1
+    for line in lines:
+        for event in line.events:
+            spent[event.name] += event.duration_ns
+            calls[event.name] += 1
     return {name: (spent[name], calls[name]) for name in spent}
 
 
