@@ -84,7 +84,7 @@ def test_a_log_becomes_a_collection(folder, seen, tmp_path, capsys):
         error = errors(state[: length + 1], at)
         np.testing.assert_array_less(rms(error), (0.012, 0.0025, 0.03, 0.006))
         start = at[-1]
-    cut = windows.cut(drives, ground, context=8, horizon=8)
+    cut = windows.gather(drives, windows.index(drives, ground, context=8, horizon=8))
     assert cut.state.shape[1:] == (17, 12) and np.isfinite(cut.state).all()
     _, meta = schema.read(tmp_path / "drives" / "drives_000.npz")
     assert meta["vehicle"]["wheels_in_body_xy"] == VEHICLE.wheels_in_body_xy

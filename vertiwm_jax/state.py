@@ -84,15 +84,3 @@ class Patches:
 
     elevation: jax.Array
     rgb: jax.Array
-
-
-@struct.dataclass
-class Trajectory:
-    """A recorded or predicted drive of T steps.
-
-    state: leaves `[..., T + 1, 3]`; state t + 1 follows command t.
-    command: leaves `[..., T]`.
-    """
-
-    state: VehicleState
-    command: Command

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from vertiwm_jax.mechanics import stress
-from vertiwm_jax.mechanics.equilibrium import compaction_resistance, equilibrium_sinkage
+from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
 from vertiwm_jax.mechanics.wheel import LOOSE_SAND, Contact, Wheel, forces
 from vertiwm_jax.terrain.soil import PRESETS, Soil, reece_moduli, stack
 
@@ -81,13 +81,6 @@ def test_small_driven_wheel(slip, drawbar, torque, sinkage):
     contact = Contact(peak=0.4, peak_slip=0.2, **EXACT)
     z, f = settle(Wheel(0.10, 0.06), soil, contact, 50.0, 10 * (1 - slip), 0.0, 10.0)
     np.testing.assert_allclose([z, f.longitudinal, f.torque], [sinkage, drawbar, torque], rtol=1e-3)
-
-
-def test_compaction_resistance_of_a_lunar_rover_wheel():
-    wheel = Wheel(0.813 / 2, 0.229)
-    np.testing.assert_allclose(
-        compaction_resistance(wheel, PRESETS["lunar"], 259.0), 28.3, rtol=0.01
-    )
 
 
 def test_hmmwv_wheel_on_the_benchmark_soils():

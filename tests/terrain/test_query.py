@@ -101,9 +101,3 @@ def test_nan_and_infinite_points_are_finite_with_finite_gradients(terrain):
     assert found.height[2] == terrain.elevation[0, -1, -1]
     slope = jax.vmap(jax.grad(lambda p: query.surface(terrain, p).height))(xy)
     assert np.isfinite(slope).all()
-
-
-def test_normal_stands_on_the_slope():
-    up = query.normal(jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, -np.sqrt(3)]]))
-    half = np.sqrt(0.5)
-    np.testing.assert_allclose(up, [[0, 0, 1], [-half, 0, half], [0, 0.75**0.5, 0.5]], atol=1e-6)

@@ -99,10 +99,3 @@ def gather(drives: Drives, index: WindowIndex) -> Windows:
         context=index.context,
         auxiliary=jax.tree.map(partial(cut_out, steps=steps), drives.auxiliary),
     )
-
-
-def cut(
-    drives: Drives, terrain: TerrainMap, context: int = 16, horizon: int = 16, stride: int = 4
-) -> Windows:
-    """All windows at once: `gather` of `index`."""
-    return gather(drives, index(drives, terrain, context, horizon, stride))

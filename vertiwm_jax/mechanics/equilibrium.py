@@ -50,14 +50,3 @@ def equilibrium_sinkage(
 
     start = jnp.zeros_like(unbalanced(jnp.zeros(())))
     return jax.lax.custom_root(unbalanced, start, bisect, divide)
-
-
-def compaction_resistance(wheel: Wheel, soil: Soil, load: Scalar) -> jax.Array:
-    """Rolling resistance `[...]` in N of a towed rigid wheel under `load` in N.
-
-    Bekker's closed form for small sinkage and n < 3 (Wong 2008, eq. 2.57 and 2.58).
-    """
-    modulus = soil.kc + wheel.width * soil.kphi
-    root = jnp.sqrt(2 * jnp.asarray(wheel.radius))
-    sinkage = (3 * load / ((3 - soil.n) * modulus * root)) ** (2 / (2 * soil.n + 1))
-    return modulus * sinkage ** (soil.n + 1) / (soil.n + 1)

@@ -22,7 +22,6 @@ __all__ = [
     "Contact",
     "Wheel",
     "WheelForces",
-    "deepen",
     "forces",
     "rigid_forces",
     "slip",
@@ -72,7 +71,7 @@ def forces(
 
     sinkage: m below the undisturbed surface; at or above the floor of the rut there is no force.
     velocity_x, velocity_y: m/s of the hub, ahead and to the left. omega: rad/s, positive ahead.
-    rut: m, the deepest sinkage that earlier passes left; see `deepen`.
+    rut: m, the deepest sinkage that earlier passes left.
     nodes: Gauss-Legendre nodes in each of five pieces of the contact; 6 are within 0.1 % (99 % of
         random wheels, soils and motions).
 
@@ -165,8 +164,3 @@ def rigid_forces(
     scale = friction * load * jax.lax.rsqrt(slip_x**2 + slip_y**2 + creep_speed**2)
     longitudinal = scale * slip_x
     return WheelForces(longitudinal, scale * slip_y, load, wheel.radius * longitudinal)
-
-
-def deepen(rut: Scalar, sinkage: Scalar) -> jax.Array:
-    """The rut `[...]` in m that a wheel at `sinkage` leaves in a rut: the memory of the soil."""
-    return jnp.maximum(rut, sinkage)

@@ -71,12 +71,6 @@ def known(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     return grid.known(terrain, terrain.belief, row, column)
 
 
-def normal(gradient: jax.Array) -> jax.Array:
-    """`[..., 2]` gradient to the `[..., 3]` unit normal of the ground, pointing up."""
-    up = jnp.concatenate([-gradient, jnp.ones_like(gradient[..., :1])], axis=-1)
-    return up / jnp.linalg.norm(up, axis=-1, keepdims=True)
-
-
 def _grid_coordinates(
     terrain: TerrainMap, x: jax.Array, y: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
