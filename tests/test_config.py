@@ -1,6 +1,7 @@
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pytest
@@ -8,7 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vertiwm_jax import config
-from vertiwm_jax.config import ConfigError
+from vertiwm_jax.config import (
+    AtLeastOne,
+    Bounds,
+    ConfigError,
+    Count,
+    CountOrZero,
+    Discount,
+    NotNegative,
+    Positive,
+    Share,
+)
 
 
 @dataclass(frozen=True)
@@ -43,6 +54,31 @@ class Careful:
     """Learns slowly unless told otherwise."""
 
     task: Task = Task("careful", optimizer=Optimizer(1e-5, clip=0.5))
+
+
+@config.settings
+class Bounded:
+    """Numbers within bounds."""
+
+    count: Count = 1
+    repeats: CountOrZero | None = None
+    rate: Positive = 1.0
+    weights: Annotated[tuple[float, float], Bounds(0)] = (0.0, 1.0)
+    discount: Discount = 0.9
+    share: Share = 1.0
+    noise: NotNegative = 0.0
+    names: Annotated[tuple[str, ...], AtLeastOne] = ("a",)
+
+
+@config.settings
+class Joined(Bounded):
+    """Two of which belong together."""
+
+    inner: Bounded = Bounded()
+
+    def check(self) -> None:
+        if self.count > 3 * self.rate:
+            raise ValueError(f"count: expected three times the rate at most, found {self.count}")
 
 
 def write(tmp_path: Path, text: str) -> Path:
@@ -102,6 +138,46 @@ def test_bad_files_are_refused_in_one_clear_line(tmp_path, text, words):
     assert message.startswith(f"{path}: ")
     for word in words:
         assert word in message
+
+
+OUT_OF_BOUNDS = [
+    ({"count": 0}, "count: expected at least 1, found 0"),
+    ({"repeats": -1}, "repeats: expected at least 0, found -1"),
+    ({"rate": 0.0}, "rate: expected more than 0, found 0.0"),
+    ({"rate": float("nan")}, "rate: expected more than 0, found nan"),
+    ({"weights": (1.0, -1.0)}, "weights: expected at least 0, found (1.0, -1.0)"),
+    ({"discount": 1.0}, "discount: expected between 0 and 1, found 1.0"),
+    ({"share": 1.5}, "share: expected 0 to 1, found 1.5"),
+    ({"noise": -0.5}, "noise: expected at least 0, found -0.5"),
+    ({"names": ()}, "names: expected at least one, found none"),
+]
+
+
+@pytest.mark.parametrize(("values", "message"), OUT_OF_BOUNDS)
+def test_values_out_of_bounds_are_refused_in_python_and_in_files(tmp_path, values, message):
+    assert Bounded(repeats=0, rate=float("inf"), share=0.0).share == 0
+    for kind in (Bounded, Joined):
+        with pytest.raises(ConfigError, match=re.escape(message)):
+            kind(**values)
+    ((name, value),) = values.items()
+    text = f"inner: {{{name}: {list(value) if isinstance(value, tuple) else value}}}"
+    text = text.replace("nan", ".nan")
+    with pytest.raises(ConfigError, match=re.escape(f"inner: {message}")):
+        config.load(Joined, write(tmp_path, text))
+
+
+def test_values_out_of_bounds_are_refused_on_the_command_line(tmp_path, capsys):
+    for argv in (["--inner.count", "0"], ["--count", "0"]):
+        with pytest.raises(SystemExit):
+            config.parse(Joined, write(tmp_path, ""), argv, prog="door")
+        assert "count: expected at least 1, found 0" in capsys.readouterr().err
+
+
+def test_what_joins_fields_is_checked_after_bounds():
+    with pytest.raises(ValueError, match="three times the rate at most, found 7"):
+        Joined(count=7)
+    with pytest.raises(ConfigError, match="rate: expected more than 0"):
+        Joined(count=7, rate=-1.0)
 
 
 def test_a_mapping_changes_what_it_names_and_leaves_the_rest_of_a_default(tmp_path):

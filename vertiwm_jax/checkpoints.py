@@ -12,13 +12,14 @@ import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 from vertiwm_jax import hosts
+from vertiwm_jax.errors import UserError
 
 State = TypeVar("State")
 
 _PARTIAL = "*.orbax-checkpoint-tmp*"
 
 
-class CheckpointError(RuntimeError):
+class CheckpointError(UserError):
     """A checkpoint that cannot be written or read; the message names the path and the mend."""
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import islice
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax
 import numpy as np
@@ -15,7 +15,7 @@ import tyro
 from vertiwm_jax import config as configuration
 from vertiwm_jax import export, runs
 from vertiwm_jax.checkpoints import CheckpointError
-from vertiwm_jax.config import ConfigError
+from vertiwm_jax.config import Bounds, ConfigError, Count, settings
 from vertiwm_jax.env.driver import Policy
 from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.evaluate import training
@@ -40,7 +40,7 @@ SHORTEST = 0.8
 ATTEMPTS = 6
 
 
-@dataclass(frozen=True)
+@settings
 class Collect:
     """Record drives of a vehicle in a simulator as `fit` and `evaluate` read them, a file a world.
 
@@ -61,25 +61,20 @@ class Collect:
     """Ground of procedural worlds, unless maps are given."""
     difficulties: tuple[Difficulty, ...] = ("low", "mid", "high")
     """How steep they are; there is one world of each kind and difficulty."""
-    repeats: int = 1
+    repeats: Count = 1
     """How many of each."""
-    drives: int = 25
+    drives: Count = 25
     """Drives on each world; `fit` learns from the first 20, and tests on 22 to 24."""
-    seconds: float = 25.0
+    seconds: Annotated[float, Bounds(STEP_SECONDS)] = 25.0
     """Duration of a drive."""
     policy: Path | None = None
     """Run folder of a policy that drives from goal to goal; the paper's sinusoids by default."""
     seed: int = 0
     """Decides everything that is random."""
-    jobs: int = 1
+    jobs: Count = 1
     """Processes that simulate."""
 
-    def __post_init__(self):
-        for name in ("drives", "jobs", "repeats"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
-        if not self.seconds >= STEP_SECONDS:
-            raise ValueError(f"seconds: expected {STEP_SECONDS} or more, found {self.seconds}")
+    def check(self):
         if self.obstacles and not (self.worlds and self.simulator == "chrono"):
             raise ValueError("obstacles: are solid in Chrono alone, and are those of given worlds")
         if self.vehicle != HMMWV and self.simulator == "chrono":

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import policy_training, runs
-from vertiwm_jax.config import ConfigError
+from vertiwm_jax.config import AtLeastOne, ConfigError, Count
 from vertiwm_jax.env.driver import Driver, Policy
 from vertiwm_jax.evaluate import ALGORITHMS
 from vertiwm_jax.evaluation import outside, policy_table, report
@@ -46,21 +46,21 @@ class Row:
         return f"{self.algorithm} in {self.model}"
 
 
-@dataclass(frozen=True)
+@configuration.settings
 class CompareConfig:
     """Train policies by several algorithms in several models, and judge them all alike."""
 
-    rows: tyro.conf.Suppress[tyro.conf.Fixed[tuple[Row, ...]]]
+    rows: tyro.conf.Suppress[tyro.conf.Fixed[Annotated[tuple[Row, ...], AtLeastOne]]]
     """Which policies; in a file only."""
-    simulators: tuple[Arena, ...] = ("builtin",)
+    simulators: Annotated[tuple[Arena, ...], AtLeastOne] = ("builtin",)
     """What they are judged in; Chrono needs PyChrono."""
     suites: tuple[Suite, ...] = tuple(SUITES)
     """Kinds of worlds that they are judged on."""
-    suite_worlds: int = 10
+    suite_worlds: Count = 10
     """How many worlds of each."""
-    pairs: int = 10
+    pairs: Count = 10
     """Tasks in a world."""
-    jobs: int = 1
+    jobs: Count = 1
     """Processes that drive, in Chrono."""
     seed: int = 0
     """Draws the worlds; how policies are trained has seeds of its own."""
@@ -75,14 +75,9 @@ class CompareConfig:
     compile_cache: Path | None = None
     """Folder that keeps compiled programs for later runs."""
 
-    def __post_init__(self):
-        if not (self.rows and self.simulators):
-            raise ValueError("rows, simulators: expected at least one of each, found none")
+    def check(self):
         if len(set(self.rows)) < len(self.rows):
             raise ValueError("rows: expected each of them once, found one again")
-        for name in ("suite_worlds", "pairs", "jobs"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
 
     @property
     def grounds(self) -> GroundConfig:

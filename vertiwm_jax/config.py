@@ -1,19 +1,21 @@
 """Typed configuration: YAML files and the command line, read strictly into frozen dataclasses.
 
 Fields may be `bool`, `int`, `float`, `str`, `Path`, `Literal`, tuples, unions of these (so also
-optional ones) and nested dataclasses. A dataclass may check its own values in `__post_init__` by
-raising `ValueError`.
+optional ones) and nested dataclasses. Bounds are said in annotations, like `Positive`; `settings`
+makes a dataclass that checks them, whether it is made in Python, from YAML or by a command line.
 """
 
 import argparse
 import contextlib
 import dataclasses
 import difflib
+import functools
 import inspect
+import math
 import re
 import sys
 import types
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import (
     Annotated,
@@ -22,6 +24,7 @@ from typing import (
     TypeVar,
     Union,
     cast,
+    dataclass_transform,
     get_args,
     get_origin,
     get_type_hints,
@@ -32,6 +35,7 @@ import tyro
 import yaml
 
 from vertiwm_jax import xla
+from vertiwm_jax.errors import UserError
 
 T = TypeVar("T")
 
@@ -39,8 +43,81 @@ _PACKAGE = Path(__file__).resolve().parent
 _FOLDERS = (_PACKAGE / "configs", _PACKAGE.parent / "configs")
 
 
-class ConfigError(ValueError):
+class ConfigError(UserError, ValueError):
     """A configuration that cannot be used; the message names file, field and mend."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """Where a number has to lie, or each number of a tuple; for `Annotated`."""
+
+    low: float
+    high: float = math.inf
+    open: bool = False
+    """Whether the bounds themselves are left out."""
+
+    def __contains__(self, value: float) -> bool:
+        if not (self.low < value if self.open else self.low <= value):
+            return False
+        return self.high == math.inf or (value < self.high if self.open else value <= self.high)
+
+    def __str__(self) -> str:
+        low, high = f"{self.low:g}", f"{self.high:g}"
+        if self.high == math.inf:
+            return f"{'more than' if self.open else 'at least'} {low}"
+        return f"between {low} and {high}" if self.open else f"{low} to {high}"
+
+
+class AtLeastOne:
+    """Says that a tuple may not be empty; for `Annotated`."""
+
+
+Positive = Annotated[float, Bounds(0, open=True)]
+NotNegative = Annotated[float, Bounds(0)]
+Share = Annotated[float, Bounds(0, 1)]
+Discount = Annotated[float, Bounds(0, 1, open=True)]
+Count = Annotated[int, Bounds(1)]
+CountOrZero = Annotated[int, Bounds(0)]
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
+def settings(cls: type[T]) -> type[T]:
+    """A frozen dataclass whose values are checked whenever one is made.
+
+    Numbers have to lie within the `Bounds` of their annotations. Then the method `check`, if there
+    is one, looks at what joins several fields. Values that are refused raise `ConfigError`, or what
+    `check` raises.
+    """
+
+    def check_all(self: Any) -> None:
+        for name, bounds in _bounds_of_fields(type(self)):
+            value = getattr(self, name)
+            if bounds is AtLeastOne:
+                if not value:
+                    raise ConfigError(f"{name}: expected at least one, found none")
+            elif value is not None:
+                numbers = value if isinstance(value, tuple) else (value,)
+                if not all(number in bounds for number in numbers):
+                    raise ConfigError(f"{name}: expected {bounds}, found {value}")
+        if hasattr(self, "check"):
+            self.check()
+
+    cls.__post_init__ = check_all  # pyright: ignore[reportAttributeAccessIssue]
+    return dataclasses.dataclass(frozen=True)(cls)
+
+
+@functools.cache
+def _bounds_of_fields(cls: Any) -> list[tuple[str, Any]]:
+    hints = get_type_hints(cls, include_extras=True)
+    fields = dataclasses.fields(cls)
+    return [(field.name, bounds) for field in fields for bounds in _bounds(hints[field.name])]
+
+
+def _bounds(kind: Any) -> Iterator[Any]:
+    for part in get_args(kind):
+        if isinstance(part, Bounds) or part is AtLeastOne:
+            yield part
+        yield from _bounds(part)
 
 
 def default_config(name: str) -> Path:

@@ -2,9 +2,9 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax
 import tyro
@@ -13,7 +13,7 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import policy_training, runs
 from vertiwm_jax.adaptation.soil_filter import SoilFilter
 from vertiwm_jax.checkpoints import CheckpointError
-from vertiwm_jax.config import ConfigError
+from vertiwm_jax.config import AtLeastOne, ConfigError, Count, CountOrZero, settings
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.evaluation import (
@@ -55,13 +55,18 @@ ALGORITHMS: dict[str, type[TrainConfig]] = {
 }
 
 
-@dataclass(frozen=True)
+@settings
 class Prediction:
     """Open-loop position errors of a model on recorded drives, beside two kinematic baselines."""
 
     data: Path
     """Folder of `.npz` files of drives, with the maps they name."""
-    models: tuple[ModelName, ...] = ("vertiwm", "nesam", "transformer", "builtin")
+    models: Annotated[tuple[ModelName, ...], AtLeastOne] = (
+        "vertiwm",
+        "nesam",
+        "transformer",
+        "builtin",
+    )
     """The models."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
@@ -74,24 +79,17 @@ class Prediction:
     """Run folders of `fit`, of which each part is a row, beside the paper's figures for it."""
     split: dataset.Split = "test"
     """Which of the drives."""
-    context: int = 16
+    context: CountOrZero = 16
     """Recorded steps that a model sees first."""
-    horizon: int = 16
+    horizon: Count = 16
     """Steps that it predicts."""
-    stride: int = 16
+    stride: Count = 16
     """Steps from one window to the next."""
     output: Path | None = None
     """Folder for tables and pictures, also of where and how the first model errs."""
 
-    def __post_init__(self):
-        if not self.models:
-            raise ValueError("models: expected at least one, found none")
-        for name, least in (("context", 0), ("horizon", 1), ("stride", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected at least {least}, found {getattr(self, name)}")
 
-
-@dataclass(frozen=True)
+@settings
 class Adaptation:
     """Open-loop position errors where the map has soils wrong, and how they are adapted to."""
 
@@ -105,19 +103,17 @@ class Adaptation:
     """What the map is made to say of all soil: a name of `terrain.soil.PRESETS`."""
     split: dataset.Split = "test"
     """Which of the drives."""
-    every: int = 1
+    every: Count = 1
     """Of how many drives one is used."""
     filter: SoilFilter = SoilFilter()
     """How soils are estimated."""
 
-    def __post_init__(self):
+    def check(self):
         if self.wrong not in PRESETS:
             raise ValueError(f"wrong: expected one of {', '.join(PRESETS)}, found {self.wrong!r}")
-        if self.every < 1:
-            raise ValueError(f"every: expected at least 1, found {self.every}")
 
 
-@dataclass(frozen=True)
+@settings
 class Calibration:
     """How far off predictions of Verti-WM are, by how much its gates or specialists disagree.
 
@@ -128,20 +124,15 @@ class Calibration:
     """Folder of `.npz` files of drives, with the maps they name."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
-    context: int = 16
+    context: CountOrZero = 16
     """Recorded steps that the model sees first."""
-    horizon: int = 16
+    horizon: Count = 16
     """Steps that it predicts."""
     output: Path | None = None
     """Folder for tables and a picture."""
 
-    def __post_init__(self):
-        for name, least in (("context", 0), ("horizon", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected at least {least}, found {getattr(self, name)}")
 
-
-@dataclass(frozen=True)
+@settings
 class Navigation:
     """Success, time, roll and pitch of a policy, on worlds that it was not trained on.
 
@@ -158,7 +149,7 @@ class Navigation:
     """Whether the policy of a run drives a second time, planning; by default as its run says."""
     simulator: Arena = "builtin"
     """What moves the vehicle; Chrono needs PyChrono, and moves one in each process."""
-    jobs: int = 1
+    jobs: Count = 1
     """Processes that drive, in Chrono."""
     vehicle: str | None = None
     """Name or YAML file of another vehicle than the policy's training was meant for."""
@@ -168,9 +159,9 @@ class Navigation:
     """Whether the rocks and trees of these maps stand there."""
     suites: tuple[Suite, ...] = ()
     """Kinds of procedural worlds; all three by default."""
-    suite_worlds: int | None = None
+    suite_worlds: Count | None = None
     """How many worlds of each suite; as many as after training by default."""
-    pairs: int | None = None
+    pairs: Count | None = None
     """Tasks in a world; as many as after training by default."""
     seed: int | None = None
     """Draws other procedural worlds than those held out."""
@@ -179,7 +170,7 @@ class Navigation:
     output: Path | None = None
     """Folder for tables, all episodes and pictures."""
 
-    def __post_init__(self):
+    def check(self):
         drawn = ("suites", "suite_worlds", "seed")
         found = [name for name in drawn if getattr(self, name) not in ((), None)]
         if self.worlds and found:
@@ -188,8 +179,8 @@ class Navigation:
             raise ValueError("obstacles: is of given worlds; procedural ones are a suite")
         if self.planning is not None and not isinstance(self.policy, Path):
             raise ValueError(f"planning: is of the policy of a run, found {self.policy}")
-        if self.jobs < 1 or (self.jobs > 1 and self.simulator != "chrono"):
-            raise ValueError("jobs: expected 1 or more, and 1 in all simulators but Chrono")
+        if self.jobs > 1 and self.simulator != "chrono":
+            raise ValueError(f"jobs: expected 1 in all simulators but Chrono, found {self.jobs}")
 
 
 def main(argv: Sequence[str] | None = None) -> None:

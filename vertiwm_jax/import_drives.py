@@ -5,14 +5,14 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
-from vertiwm_jax.config import ConfigError
+from vertiwm_jax.config import AtLeastOne, ConfigError, settings
 from vertiwm_jax.importers import collection, grid_map, resampling, rosbag, table, tartandrive
 from vertiwm_jax.importers.log import Log
 from vertiwm_jax.importers.resampling import Drive
@@ -43,11 +43,11 @@ LARGEST_ANGLE = np.radians(20)
 """Between velocity and motion, in the median: another frame, or w before x, lie beyond."""
 
 
-@dataclass(frozen=True)
+@settings
 class ImportDrives:
     """Bring logged drives into the form that `fit` and `evaluate` read, at 10 Hz."""
 
-    sources: tyro.conf.Positional[tuple[Path, ...]]
+    sources: tyro.conf.Positional[Annotated[tuple[Path, ...], AtLeastOne]]
     """Files or folders of logs, in the order in which they were driven."""
     output: Path
     """Folder to make; the map is in its folder `maps`."""
@@ -57,10 +57,6 @@ class ImportDrives:
     """What the logs are; by default as their names end."""
     map: Path | None = None
     """The ground, an .npz map; by default that of a bag's GridMap topic."""
-
-    def __post_init__(self):
-        if not self.sources:
-            raise ValueError("sources: expected a log or more, found none")
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,13 @@ import rich.progress
 from rich.console import Console
 
 from vertiwm_jax import config, hosts, tracking
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.tensorboard import Events
 
 METRICS = "metrics.jsonl"
 
 
-class RunError(RuntimeError):
+class RunError(UserError):
     """A run folder that cannot be read or written; the message names the path."""
 
 

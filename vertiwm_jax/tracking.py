@@ -6,11 +6,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vertiwm_jax.errors import UserError
+
 if TYPE_CHECKING:
     from wandb import Run as Tracker
 
 
-class TrackingError(RuntimeError):
+class TrackingError(UserError):
     """A run that cannot be tracked; the message says what is missing."""
 
 

@@ -20,6 +20,8 @@ from jax.sharding import Mesh
 
 from vertiwm_jax import checkpoints, devices, hosts, xla
 from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.config import Count, settings
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.runs import Run, RunError
 from vertiwm_jax.tracking import TrackingError
 
@@ -38,19 +40,14 @@ class Algorithm(Protocol[State]):
     def iterate(self, data: Any, state: State, /) -> tuple[State, dict[str, jax.Array]]: ...
 
 
-@dataclass(frozen=True)
+@settings
 class CheckpointConfig:
     """What is kept of a training."""
 
-    checkpoint_every: int = 20
+    checkpoint_every: Count = 20
     """Iterations between checkpoints."""
-    keep: int = 3
+    keep: Count = 3
     """Newest checkpoints that are kept."""
-
-    def __post_init__(self):
-        for name in ("checkpoint_every", "keep"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -66,7 +63,7 @@ class Work:
     batch: int = 1
 
 
-class TrainingError(RuntimeError):
+class TrainingError(UserError):
     """Training cannot go on; the message says what is left to go on from."""
 
 

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -11,7 +11,7 @@ import tyro
 
 from vertiwm_jax import policy_training
 from vertiwm_jax.checkpoints import CheckpointError
-from vertiwm_jax.config import ConfigError
+from vertiwm_jax.config import ConfigError, CountOrZero, settings
 from vertiwm_jax.evaluate import training
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV
@@ -23,7 +23,7 @@ from vertiwm_jax.viewing.scene import Scene
 from vertiwm_jax.world_model.choice import ModelName, choose
 
 
-@dataclass(frozen=True)
+@settings
 class View:
     """Show how a policy drives a task, or a recorded drive with what a model predicts of it."""
 
@@ -37,11 +37,11 @@ class View:
     """Name or YAML file of the vehicle; by default that of the policy's training, or the HMMWV."""
     suite: Suite | None = None
     """Kind of procedural worlds to drive a policy on; all that were held out by default."""
-    task: int | None = None
+    task: CountOrZero | None = None
     """Which of the tasks there; the first by default."""
-    seed: int | None = None
+    seed: CountOrZero | None = None
     """Which of the policies that the run trained side by side; the first by default."""
-    drive: int | None = None
+    drive: CountOrZero | None = None
     """Which drive of a file; the first by default."""
     output: Path | None = None
     """File of the recording; beside what is shown by default."""
@@ -50,7 +50,7 @@ class View:
     movie: Path | None = None
     """A .gif or .mp4 file to write instead of a recording."""
 
-    def __post_init__(self):
+    def check(self):
         if self.movie and self.movie.suffix not in movie.WRITERS:
             found = self.movie.suffix or "none"
             raise ValueError(f"movie: expected the ending .gif or .mp4, found {found}")

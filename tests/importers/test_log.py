@@ -103,7 +103,7 @@ def test_stamps_that_repeat_are_refused(arrays):
 
 
 def test_settings_of_no_vehicle():
-    with pytest.raises(ValueError, match="track: expected > 0, found 0"):
+    with pytest.raises(ValueError, match="track: expected more than 0, found 0"):
         VehicleSettings(wheelbase=1.0, track=0.0)
     with pytest.raises(ValueError, match="speed: expected how many SI units one unit is, found 0"):
         Units(speed=0.0)

@@ -147,5 +147,5 @@ def test_the_logged_point_may_lie_elsewhere():
 def test_settings_that_contradict_each_other():
     with pytest.raises(ValueError, match=r"shortest: expected .* half of longest"):
         Resampling(shortest=200, longest=250)
-    with pytest.raises(ValueError, match="window: expected seconds, > 0, found 0"):
+    with pytest.raises(ValueError, match="window: expected more than 0, found 0"):
         Resampling(window=0.0)

@@ -1,11 +1,10 @@
 """Drives of a simulator as a vehicle would have logged them: sampled, late, noisy, with gaps."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
+from vertiwm_jax.config import NotNegative, Positive, settings
 from vertiwm_jax.state import STEP_SECONDS
 
 COLUMNS = (
@@ -15,27 +14,22 @@ COLUMNS = (
 _TOLERANCE = 1e-9
 
 
-@dataclass(frozen=True)
+@settings
 class NoiseConfig:
     """What a vehicle's localisation does to its poses; SI units, at the vehicle's own size."""
 
-    rate: float = 50.0
+    rate: Positive = 50.0
     """Poses a second."""
-    position: float = 0.001
+    position: NotNegative = 0.001
     """m, standard deviation along each axis."""
-    attitude: float = 0.005
+    attitude: NotNegative = 0.005
     """rad, standard deviation about each axis."""
-    latency: float = 0.02
+    latency: NotNegative = 0.02
     """s by which the stamp of a pose is late; commands have stamps of their own."""
     dropped: float = 0.05
     """Share of samples that are lost."""
 
-    def __post_init__(self):
-        if not self.rate > 0:
-            raise ValueError(f"rate: expected poses a second, > 0, found {self.rate}")
-        for name in ("position", "attitude", "latency"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected 0 or more, found {getattr(self, name)}")
+    def check(self):
         if not 0 <= self.dropped < 1:
             raise ValueError(f"dropped: expected 0 or more, below 1, found {self.dropped}")
 

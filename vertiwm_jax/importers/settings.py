@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from vertiwm_jax.config import Positive, settings
 from vertiwm_jax.terrain.classes import STANDARD
 from vertiwm_jax.terrain.map import ELEVATION_RANGE
 
@@ -10,25 +11,20 @@ Triple = tuple[float, float, float]
 Names = tuple[str, str, str]
 
 
-@dataclass(frozen=True)
+@settings
 class VehicleSettings:
     """The wheels, and what the log calls the pose of the vehicle."""
 
-    wheelbase: float
+    wheelbase: Positive
     """m between the axles."""
-    track: float
+    track: Positive
     """m between left and right wheels."""
     logged_point: Triple = (0.0, 0.0, 0.0)
     """The point whose position is logged, in the body frame of this project (x forward, y left,
     z up, from the point between the four wheel centres), m."""
-    scale: float = 1.0
+    scale: Positive = 1.0
     """m at full size that 1 m of the vehicle is, as in its file; drives and map become as large,
     and times and speeds its root times as large, before `resampling`."""
-
-    def __post_init__(self):
-        for name in ("wheelbase", "track", "scale"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected > 0, found {getattr(self, name)}")
 
     @property
     def wheels_in_body_xy(self) -> list[list[float]]:
@@ -37,7 +33,7 @@ class VehicleSettings:
         return [[x, y], [x, -y], [-x, y], [-x, -y]]
 
 
-@dataclass(frozen=True)
+@settings
 class Units:
     """How many SI units one unit of the log is: 1e-9 s for nanoseconds, 0.27778 m/s for km/h."""
 
@@ -54,7 +50,7 @@ class Units:
     steering: float = 1.0
     """rad of the front wheels, rad/s of commanded yaw rates; negative where right is positive."""
 
-    def __post_init__(self):
+    def check(self):
         for name, value in vars(self).items():
             if value == 0:
                 raise ValueError(f"{name}: expected how many SI units one unit is, found 0")
@@ -75,15 +71,15 @@ class Frames:
     """What becomes the origin of the world, in the world of the log once z is up, m."""
 
 
-@dataclass(frozen=True)
+@settings
 class Resampling:
     """How a log becomes drives at 10 Hz."""
 
-    gap: float = 0.5
+    gap: Positive = 0.5
     """s without a pose that end a drive; the next one begins after them."""
-    command_gap: float = 0.5
+    command_gap: Positive = 0.5
     """The same for commands; the last one is held as long."""
-    window: float = 0.5
+    window: Positive = 0.5
     """s over which a parabola is fitted to poses, where velocities are not logged."""
     shortest: int = 32
     """Drives of fewer steps are left out; a window of `fit` has 32."""
@@ -91,10 +87,7 @@ class Resampling:
     """Drives of more steps are cut into equal pieces: `fit` learns from the first 20 drives of
     each 25, and tests on the last 3."""
 
-    def __post_init__(self):
-        for name in ("gap", "command_gap", "window"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected seconds, > 0, found {getattr(self, name)}")
+    def check(self):
         if not 1 <= self.shortest <= self.longest / 2:
             raise ValueError(
                 f"shortest: expected 1 or more, and half of longest ({self.longest}) at most, so "
@@ -102,7 +95,7 @@ class Resampling:
             )
 
 
-@dataclass(frozen=True)
+@settings
 class Table:
     """Names of the columns of a CSV or Parquet file, a row a moment."""
 
@@ -127,12 +120,12 @@ class Table:
     drive: str | None = None
     """Tells drives apart; by default a file is one drive."""
 
-    def __post_init__(self):
+    def check(self):
         if (self.rpy is None) == (self.quaternion is None):
             raise ValueError("rpy, quaternion: expected one of them")
 
 
-@dataclass(frozen=True)
+@settings
 class GridMapSettings:
     """Ground from all messages of a grid_map_msgs/GridMap topic; the newest height counts."""
 
@@ -147,7 +140,7 @@ class GridMapSettings:
     elevation_range: tuple[float, float] = ELEVATION_RANGE
     """m within which all heights lie; models know that of the default."""
 
-    def __post_init__(self):
+    def check(self):
         if self.ground not in STANDARD.names:
             names = ", ".join(STANDARD.names)
             raise ValueError(f"ground: expected one of {names}, found {self.ground}")

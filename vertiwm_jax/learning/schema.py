@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.state import STEP_SECONDS
 
 _REQUIRED = {
@@ -60,7 +61,7 @@ _TRAVEL = (0.6, 1.6)
 """Bounds of that ratio: another sampling rate, km/h or centimetres lie beyond."""
 
 
-class DataError(ValueError):
+class DataError(UserError, ValueError):
     """Recorded drives that cannot be used; the message names file, field and expectation."""
 
 

@@ -8,23 +8,19 @@ from typing import Any, Generic, TypeVar
 import jax
 
 from vertiwm_jax import devices, training
+from vertiwm_jax.config import Count, settings
 from vertiwm_jax.runs import Run
 from vertiwm_jax.training import Algorithm, CheckpointConfig, Work
 
 State = TypeVar("State")
 
 
-@dataclass(frozen=True)
+@settings
 class LoopConfig(CheckpointConfig):
     """What is kept of a training, and how often it is done."""
 
-    seeds: int = 1
+    seeds: Count = 1
     """Trainings with different random keys, run side by side."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.seeds < 1:
-            raise ValueError(f"seeds: expected at least 1, found {self.seeds}")
 
 
 @dataclass(frozen=True)

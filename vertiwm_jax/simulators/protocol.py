@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.learning.dataset import Array, Auxiliary
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -17,7 +18,7 @@ _TYRE = 0.2
 """Half of the length, m, over which the ground under a tyre is taken for a plane."""
 
 
-class SimulatorError(RuntimeError):
+class SimulatorError(UserError):
     """A simulator that cannot be run; the message says what it takes."""
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from flax import struct
 from numpy.typing import ArrayLike
 
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.terrain import soil
 from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
@@ -27,7 +28,7 @@ Chrono drives and the procedural worlds, so that one encoder sees one scale ever
 _SHARED = ("origin", "resolution", "elevation_range", "class_rgb", "deformable", "soils")
 
 
-class MapError(ValueError):
+class MapError(UserError, ValueError):
     """A map that cannot be used; the message names the file, the field and the mend."""
 
     def __init__(self, name: str, field: str, expected: str, found: str, mend: str = "") -> None:
