@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks._harness import measure, parser, report
-from vertiwm_jax.terrain import crop, query, worlds
+from vertiwm_jax.terrain import patches, query, worlds
 from vertiwm_jax.terrain.worlds import WorldConfig
 
 VEHICLES = 20
@@ -28,10 +28,10 @@ def main() -> None:
     world = jnp.arange(VEHICLES)
     worlds_of_points = jnp.arange(POINTS // 4) % VEHICLES
 
-    patches = jax.jit(jax.vmap(lambda m, w, p, a: crop.patches(m.select(w), p, a), (None, 0, 0, 0)))
+    look = jax.jit(jax.vmap(lambda m, w, p, a: patches.query(m.select(w), p, a), (None, 0, 0, 0)))
     surface = jax.jit(jax.vmap(lambda m, w, p: query.surface(m.select(w), p), (None, 0, 0)))
 
-    seen = measure(patches, terrain, world, position, yaw)
+    seen = measure(look, terrain, world, position, yaw)
     touched = measure(surface, terrain, worlds_of_points, points)
     report(
         "map query",

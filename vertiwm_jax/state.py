@@ -1,4 +1,4 @@
-"""The pytrees that flow through every model: state, command, patches, trajectory.
+"""The pytrees that flow through every model: state and command.
 
 Every array may carry any number of leading batch axes, written `...`.
 """
@@ -68,19 +68,3 @@ class Command:
     def vector(self) -> jax.Array:
         """`[..., 2]` speed and steering."""
         return jnp.stack([self.speed, self.steering], axis=-1)
-
-
-CELL_PIXELS = 8
-"""Side of the squares of pixels in which patches are queried, and of which each is encoded."""
-
-
-@struct.dataclass
-class Patches:
-    """Vehicle-aligned observations of the ground (the paper's m_t), in [-1, 1].
-
-    elevation: `[..., 128, 128]`; row 0 is farthest ahead, column 0 farthest left.
-    rgb: `[..., 128, 128, 3]` semantic colours, same pixels.
-    """
-
-    elevation: jax.Array
-    rgb: jax.Array

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from benchmarks.peers.torch_query import tensor
-from vertiwm_jax.state import CELL_PIXELS
+from vertiwm_jax.terrain.patches import CELL_PIXELS
 from vertiwm_jax.world_model.sizes import TransformerSize
 from vertiwm_jax.world_model.specialist_network import WINDOW
 

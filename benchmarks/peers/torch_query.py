@@ -12,8 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from vertiwm_jax.terrain.crop import PATCH_METRES, PATCH_PIXELS, RELIEF_METRES
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.patches import PATCH_METRES, PATCH_PIXELS, RELIEF_METRES
 
 SOIL = ("kc", "kphi", "n", "cohesion", "friction_angle", "shear_modulus")
 """Columns of a soil, named as in `terrain.soil.Soil`."""

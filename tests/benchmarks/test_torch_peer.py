@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="needs the extra `peers`")
 from benchmarks import torch_peer  # noqa: E402
 from benchmarks.peers import torch_query  # noqa: E402
 from benchmarks.peers.torch_vertiwm import TorchVertiWM  # noqa: E402
-from vertiwm_jax.terrain import crop  # noqa: E402
+from vertiwm_jax.terrain import patches  # noqa: E402
 from vertiwm_jax.terrain.worlds import WorldConfig, labels  # noqa: E402
 from vertiwm_jax.world_model.model import VertiWM  # noqa: E402
 
@@ -58,10 +58,9 @@ def test_the_vehicles_move_each_its_own_way(states, drives):
 
 
 def test_patches_are_the_same(drives):
-    config = VertiWM.pretrained()[0].transformer.exteroception.patches
 
     def look(world, state):
-        return crop.patches(drives.terrain.select(world), state.position, state.rpy[2], config)
+        return patches.query(drives.terrain.select(world), state.position, state.rpy[2])
 
     seen = jax.jit(jax.vmap(look))(drives.worlds, drives.starts)
     worlds = torch_query.tensor(drives.worlds).long()

@@ -14,8 +14,8 @@ from vertiwm_jax.learning.windows import Windows, cut
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.state import Command, VehicleState
-from vertiwm_jax.terrain import crop, obstacles, query
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain import obstacles, patches, query
 from vertiwm_jax.terrain.map import MapError
 
 DRIVES = Path(__file__).parents[1] / "data" / "chrono_drives"
@@ -82,7 +82,7 @@ def test_a_mirrored_vehicle_sees_the_mirrored_patch(both):
 
     def look(windows):
         terrain = both.select(windows.world[0])
-        return crop.patches(terrain, windows.state[0, 0, :3], windows.state[0, 0, 5])
+        return patches.query(terrain, windows.state[0, 0, :3], windows.state[0, 0, 5])
 
     here, there = look(windows), look(image)
     same = np.isclose(there.elevation[:, ::-1], here.elevation)

@@ -18,9 +18,8 @@ from vertiwm_jax.learning.autoencoders import (
 from vertiwm_jax.learning.fitting import FitConfig
 from vertiwm_jax.networks.encoder import TerrainEncoder
 from vertiwm_jax.runs import Run
-from vertiwm_jax.terrain import crop
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain.crop import PatchConfig
+from vertiwm_jax.terrain import patches
 
 DRIVES = Path(__file__).parents[1] / "data" / "chrono_drives"
 CONFIG = AutoencoderConfig(batch=4, validation=8)
@@ -61,24 +60,21 @@ def test_a_moved_vehicle_stays_on_the_map_as_high_above_the_ground():
         np.testing.assert_allclose(moved[2], 7 + 0.1 * (xy[0] - 2), rtol=1e-5)
 
 
-@pytest.mark.parametrize("reference", ["map", "vehicle"])
-def test_errors_are_in_metres_and_pixels(data, params, reference, monkeypatch):
-    config = replace(CONFIG, patches=PatchConfig(reference, "bilinear"))
+def test_errors_are_in_metres_and_pixels(data, params, monkeypatch):
     ground = data.validation_terrain
 
-    def off(_, patches):
+    def off(_, seen):
         """20 cm too high everywhere, and grey on the right half."""
-        unit = 4.0 if reference == "vehicle" else 8.0
-        colours = patches.rgb.at[:, 64:].set(ground.class_rgb[1] / 127.5 - 1)
-        return replace(patches, elevation=patches.elevation + 0.2 / unit, rgb=colours)
+        colours = seen.rgb.at[:, 64:].set(ground.class_rgb[1] / 127.5 - 1)
+        return replace(seen, elevation=seen.elevation + 0.2 / 4.0, rgb=colours)
 
     monkeypatch.setattr(autoencoders, "reconstruct", off)
-    found = AutoencoderProblem(config).validate(params, data)
+    found = AutoencoderProblem(CONFIG).validate(params, data)
     assert float(found["elevation_rms"]) == pytest.approx(0.2, rel=1e-4)
     places, right = data.validation, []
     for i in range(len(places.yaw)):
         world = ground.select(places.world[i])
-        rgb = crop.patches(world, places.position[i], places.yaw[i]).rgb
+        rgb = patches.query(world, places.position[i], places.yaw[i]).rgb
         concrete = np.isclose(rgb, ground.class_rgb[1] / 127.5 - 1, atol=1e-3).all(axis=-1)
         right.append(0.5 + concrete[:, 64:].sum() / concrete.size)
     assert float(found["colour_accuracy"]) == pytest.approx(np.mean(right), abs=1e-4)
@@ -98,18 +94,16 @@ def test_training_reconstructs_better_and_gives_encoders(data, params, tmp_path)
     chex.assert_trees_all_equal(fitting.load(run.folder, params), fitted)
 
     encoders = autoencoders.encoders(fitted)
-    patches = crop.patches(
-        data.terrain, data.places.position[0], data.places.yaw[0], CONFIG.patches
-    )
+    seen = patches.query(data.terrain, data.places.position[0], data.places.yaw[0])
     for channels, weights, patch in (
-        (1, encoders.elevation, patches.elevation[..., None]),
-        (3, encoders.semantic, patches.rgb),
+        (1, encoders.elevation, seen.elevation[..., None]),
+        (3, encoders.semantic, seen.rgb),
     ):
         latent = TerrainEncoder(channels).apply(weights, patch)
         assert latent.shape == (16, 16, 18)
-    again = autoencoders.reconstruct(fitted, patches)
+    again = autoencoders.reconstruct(fitted, seen)
     assert again.elevation.shape == (128, 128)
-    assert float(jnp.abs(again.elevation - patches.elevation).mean()) < 0.05
+    assert float(jnp.abs(again.elevation - seen.elevation).mean()) < 0.05
 
 
 @pytest.mark.parametrize(

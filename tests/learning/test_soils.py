@@ -22,7 +22,7 @@ LATENT = jnp.zeros((16, 16, LATENT_CHANNELS))
 
 def params():
     keys = jax.random.split(jax.random.key(0))
-    encoders = Exteroception(PROBLEM.config.patches).init_params(keys[0])
+    encoders = Exteroception().init_params(keys[0])
     return {"encoders": encoders, "soil": SoilPredictor().init(keys[1], LATENT, jnp.float32(0))}
 
 

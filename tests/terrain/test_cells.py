@@ -1,16 +1,12 @@
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from vertiwm_jax.networks.encoder import in_rows
-from vertiwm_jax.terrain import cells, crop
+from vertiwm_jax.terrain import cells, patches
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain.crop import PatchConfig
 
-RELATIVE = PatchConfig("vehicle", "bilinear")
 COARSE, AS_COARSE_AS_CLASSES, FINE, FINE_CLASSES = (1.3, 4), (1.0, 1), (0.98, 4), (1.0, 2 / 3)
 POSES = [
     (2.3, 1.7, 1.25, -0.8),
@@ -35,17 +31,17 @@ def kernels(outputs: int = 5):
     return of_both[0], of_both[1:]
 
 
-@partial(jax.jit, static_argnames="config")
-def projected(terrain, position, yaw, of_both, config=RELATIVE):
-    found = cells.projections(terrain, position, yaw, config, *of_both)
+@jax.jit
+def projected(terrain, position, yaw, of_both):
+    found = cells.projections(terrain, position, yaw, *of_both)
     return tuple(in_rows(x) for x in found)
 
 
-@partial(jax.jit, static_argnames="config")
-def of_patches(terrain, position, yaw, of_both, config=RELATIVE):
+@jax.jit
+def of_patches(terrain, position, yaw, of_both):
     """The same of all pixels, one cell after the other."""
-    patches = crop.patches(terrain, position, yaw, config)
-    squares = patches.elevation.reshape(16, 8, 16, 8), patches.rgb.reshape(16, 8, 16, 8, 3)
+    seen = patches.query(terrain, position, yaw)
+    squares = seen.elevation.reshape(16, 8, 16, 8), seen.rgb.reshape(16, 8, 16, 8, 3)
     of_elevation, of_colours = (k.reshape(*k.shape[:-2], 8, 8, -1) for k in of_both)
     return (
         jnp.einsum("aibj,ijf->abf", squares[0], of_elevation, precision="highest"),
@@ -59,21 +55,17 @@ def same(found, expected, share=0.01):
     assert np.mean(np.abs(found[1] - expected[1]).max(-1) > 1e-5) <= share
 
 
-@pytest.mark.parametrize("config", [RELATIVE, PatchConfig()])
 @pytest.mark.parametrize("pose", POSES)
 @pytest.mark.parametrize(
     "resolution, vertices_a_class", [COARSE, AS_COARSE_AS_CLASSES, FINE, FINE_CLASSES]
 )
-def test_projections_are_those_of_all_pixels(resolution, vertices_a_class, pose, config):
+def test_projections_are_those_of_all_pixels(resolution, vertices_a_class, pose):
     """Read by cells or by pixels, near and beyond the edge, at any heading."""
     terrain = world(resolution, vertices_a_class)
     coarse = (resolution, vertices_a_class) in (COARSE, AS_COARSE_AS_CLASSES)
     assert cells._is_coarse(terrain) == coarse
     at = jnp.array(pose[:3]), jnp.float32(pose[3])
-    same(
-        projected(terrain, *at, kernels(), config=config),
-        of_patches(terrain, *at, kernels(), config=config),
-    )
+    same(projected(terrain, *at, kernels()), of_patches(terrain, *at, kernels()))
 
 
 @pytest.mark.parametrize("classes", [1, 10])  # no cell has a border in it, or most have

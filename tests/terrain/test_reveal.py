@@ -8,8 +8,8 @@ import pytest
 from env.worlds import GRASS, SNOW, hills
 from scipy.interpolate import RegularGridInterpolator
 
-from vertiwm_jax.terrain import crop, obstacles, query, reveal
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain import obstacles, patches, query, reveal
 from vertiwm_jax.terrain.reveal import RevealConfig
 
 DISC = RevealConfig(range=12.0)
@@ -114,8 +114,8 @@ def test_unknown_ground_is_like_that_below_and_what_is_known_is_as_it_is():
     np.testing.assert_array_equal(far.friction, below.friction)
     near = jnp.array([[5.0, 5.0], [-5.0, 5.0], [7.0, -2.0]])
     chex.assert_trees_all_equal(query.surface(believed, near), query.surface(terrain, near))
-    patches = [crop.patches(ground, *at(x, y, yaw)) for ground in (believed, terrain)]
-    chex.assert_trees_all_equal(*patches)
+    seen = [patches.query(ground, *at(x, y, yaw)) for ground in (believed, terrain)]
+    chex.assert_trees_all_equal(*seen)
 
 
 def test_rocks_are_there_once_their_middle_is_seen():

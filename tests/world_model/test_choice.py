@@ -13,7 +13,6 @@ from world_model.examples import commands, driving, one, rough
 from vertiwm_jax.dynamics import embedding, rollout
 from vertiwm_jax.world_model.choice import choose, lean, rounded
 from vertiwm_jax.world_model.model import ModelConfig
-from vertiwm_jax.world_model.perception import Exteroception
 from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
 
 TERRAIN, STATES, COMMANDS = rough(), driving(3, 5), commands(8)
@@ -69,8 +68,6 @@ def test_nesam_needs_latents_for_soils():
 def test_what_needs_latents_is_refused():
     with pytest.raises(ValueError, match="remembers: expected latents"):
         TransformerSpecialist(terrain="none", remembers="glance")
-    with pytest.raises(ValueError, match="remembers: expected latents"):
-        TransformerSpecialist(exteroception=Exteroception(tune_encoders=True), remembers="glance")
     model, params = choose("transformer")
     with pytest.raises(ValueError, match="embeddings: expected a model that sees"):
         embedding(jax.eval_shape(lean(model).init, params, TERRAIN, one(STATES, 0)))

@@ -23,13 +23,12 @@ from vertiwm_jax.dynamics import disagreement, rollout
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.terrain.crop import PatchConfig
 from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.model import ModelConfig, VertiWM
 from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception, View
 from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
 
-TERRAIN, TAUGHT = rough(), Exteroception(PatchConfig())
+TERRAIN = rough()
 
 
 @struct.dataclass
@@ -154,11 +153,10 @@ def test_an_untrained_gate_takes_the_middle_of_both():
 
 
 def test_both_see_the_fused_state_through_their_own_encoders():
-    model = replace(MODEL, nesam=SeeingBicycle(TAUGHT))
-    history = init(PARAMS, TERRAIN, STATE, model=model)
-    after, history = step(PARAMS, TERRAIN, history, STATE, COMMAND, model=model)
+    history = init(PARAMS, TERRAIN, STATE)
+    after, history = step(PARAMS, TERRAIN, history, STATE, COMMAND)
     for name in ("transformer", "nesam"):
-        specialist, params = getattr(model, name), getattr(PARAMS, name)
+        specialist, params = getattr(MODEL, name), getattr(PARAMS, name)
         expected = init(params, TERRAIN, after, model=specialist).perception
         seen = getattr(history, name).perception
         # A pixel on a border between classes may fall to its other side.
@@ -187,11 +185,10 @@ def test_shared_encoders_are_those_of_the_transformer():
 def test_shared_patches_are_queried_once(monkeypatch):
     looks, plain = [], Exteroception.look
     monkeypatch.setattr(Exteroception, "look", lambda *a: looks.append(a[0]) or plain(*a))
-    for model, expected in ((MODEL, 1), (replace(MODEL, nesam=SeeingBicycle(TAUGHT)), 2)):
-        history = jax.eval_shape(model.init, PARAMS, TERRAIN, STATE)
-        looks.clear()
-        jax.eval_shape(model.step, PARAMS, TERRAIN, history, STATE, COMMAND)
-        assert len(looks) == expected
+    history = jax.eval_shape(MODEL.init, PARAMS, TERRAIN, STATE)
+    looks.clear()
+    jax.eval_shape(MODEL.step, PARAMS, TERRAIN, history, STATE, COMMAND)
+    assert len(looks) == 1
 
 
 def test_coefficients_are_in_the_history_and_vary_along_a_drive():

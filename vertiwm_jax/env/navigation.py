@@ -20,7 +20,7 @@ from vertiwm_jax.env.termination import Ending, edge_distance, first_ending, is_
 from vertiwm_jax.env.variation import Variation, VariationConfig
 from vertiwm_jax.networks.policy import Senses
 from vertiwm_jax.state import STEP_SECONDS, VehicleState
-from vertiwm_jax.terrain import crop, obstacles, query, reveal
+from vertiwm_jax.terrain import obstacles, patches, query, reveal
 from vertiwm_jax.terrain.map import TerrainMap
 
 
@@ -40,7 +40,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         chassis = self.config.chassis
         reach = float(np.hypot(chassis.wheelbase, chassis.track)) / 2
         top_speed = max(abs(speed) for speed in self.config.speed_range)
-        crop.footprint_covered(reach, top_speed)
+        patches.footprint_covered(reach, top_speed)
 
     def make_params(self, dynamics: Params, terrain: TerrainMap, tasks: Tasks) -> NavigationParams:
         """Parameters whose pool of starts is `tasks`, each settled on the ground by the model.

@@ -12,10 +12,9 @@ from vertiwm_jax import devices
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.networks.encoder import TerrainAutoencoder
-from vertiwm_jax.state import Patches
-from vertiwm_jax.terrain import crop, query
-from vertiwm_jax.terrain.crop import PATCH_PIXELS, RELIEF_METRES, PatchConfig
+from vertiwm_jax.terrain import patches, query
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.patches import PATCH_PIXELS, RELIEF_METRES, Patches
 from vertiwm_jax.world_model.perception import EncoderParams
 
 _ELEVATION, _SEMANTIC = TerrainAutoencoder(1), TerrainAutoencoder(3)
@@ -26,8 +25,6 @@ _NETWORKS = {"elevation": _ELEVATION, "semantic": _SEMANTIC}
 class AutoencoderConfig:
     """Which patches a pair of autoencoders is trained on."""
 
-    patches: PatchConfig = PatchConfig("vehicle", "bilinear")
-    """How heights become patches; models that use the encoders must use the same."""
     batch: int = 16
     """Patches in a batch."""
     offset: float = 20.0
@@ -107,10 +104,10 @@ class AutoencoderProblem:
 
         def one(params: Params, terrain: TerrainMap, place: Places) -> jax.Array:
             terrain = terrain.select(place.world)
-            patches = crop.patches(terrain, place.position, place.yaw, self.config.patches)
-            again = reconstruct(params, patches)
-            elevation = jnp.mean((again.elevation - patches.elevation) ** 2)
-            return elevation + jnp.mean((again.rgb - patches.rgb) ** 2)
+            seen = patches.query(terrain, place.position, place.yaw)
+            again = reconstruct(params, seen)
+            elevation = jnp.mean((again.elevation - seen.elevation) ** 2)
+            return elevation + jnp.mean((again.rgb - seen.rgb) ** 2)
 
         places = near(data, key, self.config)
         return jnp.mean(devices.spread(one, (None, None, 0))(params, data.terrain, places))
@@ -129,17 +126,17 @@ class AutoencoderProblem:
 
         def one(params: Params, terrain: TerrainMap, place: Places) -> tuple[jax.Array, ...]:
             world = terrain.select(place.world)
-            patches = crop.patches(world, place.position, place.yaw, config.patches)
-            again = reconstruct(params, patches)
-            elevation = jnp.mean((again.elevation - patches.elevation) ** 2)
-            colour = jnp.mean((again.rgb - patches.rgb) ** 2)
-            same = nearest(terrain, again.rgb) == nearest(terrain, patches.rgb)
+            seen = patches.query(world, place.position, place.yaw)
+            again = reconstruct(params, seen)
+            elevation = jnp.mean((again.elevation - seen.elevation) ** 2)
+            colour = jnp.mean((again.rgb - seen.rgb) ** 2)
+            same = nearest(terrain, again.rgb) == nearest(terrain, seen.rgb)
             return elevation, colour, jnp.mean(same)
 
         means = devices.spread(one, (None, None, 0), config.batch)(params, terrain, data.validation)
         elevation, colour, accuracy = map(jnp.mean, means)
         return {
-            "elevation_rms": _metres(terrain, config.patches) * jnp.sqrt(elevation),
+            "elevation_rms": RELIEF_METRES * jnp.sqrt(elevation),
             "colour_accuracy": accuracy,
             "error": elevation + colour,
         }
@@ -166,10 +163,10 @@ def encoders(params: Params) -> EncoderParams:
     )
 
 
-def reconstruct(params: Params, patches: Patches) -> Patches:
+def reconstruct(params: Params, seen: Patches) -> Patches:
     """Patches after encoding and decoding."""
-    elevation = _ELEVATION.apply(params["elevation"], patches.elevation[..., None])
-    rgb = _SEMANTIC.apply(params["semantic"], patches.rgb)
+    elevation = _ELEVATION.apply(params["elevation"], seen.elevation[..., None])
+    rgb = _SEMANTIC.apply(params["semantic"], seen.rgb)
     return Patches(cast(jax.Array, elevation)[..., 0], cast(jax.Array, rgb))
 
 
@@ -181,9 +178,3 @@ def _move(terrain: TerrainMap, position: jax.Array, offset: jax.Array) -> jax.Ar
     xy = jnp.clip(position[:2] + offset, corners.min(axis=0), corners.max(axis=0))
     above = position[2] - query.height(terrain, position[:2])
     return jnp.append(xy, query.height(terrain, xy) + above)
-
-
-def _metres(terrain: TerrainMap, config: PatchConfig) -> jax.Array | float:
-    """Metres of height that are 1 in a patch."""
-    low, high = terrain.elevation_range
-    return RELIEF_METRES if config.reference == "vehicle" else 0.5 * (high - low)

@@ -175,7 +175,7 @@ class _Pipeline:
         kinds, before = config.learns_from, self._begun
         drives = self._drives(kinds)
         if self.start is None and params.encoders is not None:
-            patches = replace(self.config.patches, patches=specialist.exteroception.patches)
+            patches = self.config.patches
             places = cache(lambda: PatchData.of(patches, *drives()))
             seeing, schedule = name, config.autoencoders
             if self.config.model.encoders == "shared":

@@ -10,13 +10,14 @@ from vertiwm_jax import devices
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning.autoencoders import AutoencoderConfig, PatchData, Places, near
 from vertiwm_jax.networks import soil_predictor
+from vertiwm_jax.networks.encoder import TerrainEncoder
 from vertiwm_jax.networks.soil_predictor import BOUNDS, SoilPredictor
-from vertiwm_jax.terrain import crop, query
+from vertiwm_jax.terrain import patches, query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
-from vertiwm_jax.world_model.perception import EncoderParams, Exteroception
+from vertiwm_jax.world_model.perception import EncoderParams
 
-_NETWORK = SoilPredictor()
+_ENCODER, _NETWORK = TerrainEncoder(3), SoilPredictor()
 
 
 @dataclass(frozen=True)
@@ -53,10 +54,9 @@ class SoilProblem:
     ) -> tuple[jax.Array, jax.Array]:
         """`[6]` differences at one place, zero on rigid ground, and 1 on soil."""
         world = terrain.select(place.world)
-        exteroception = Exteroception(self.config.patches)
-        patches = crop.patches(world, place.position, place.yaw, self.config.patches)
-        encoders = cast(EncoderParams, params["encoders"])
-        latent = exteroception.encode(encoders, patches).semantic
+        seen = patches.query(world, place.position, place.yaw)
+        encoder = cast(EncoderParams, jax.lax.stop_gradient(params["encoders"])).semantic
+        latent = cast(jax.Array, _ENCODER.apply(encoder, seen.rgb))
         predicted = cast(Soil, _NETWORK.apply(params["soil"], latent, jnp.float32(0)))
         kind = query.surface(world, place.position[:2]).semantic
         true = jax.tree.map(lambda x: x[kind], world.soils)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax.state import CELL_PIXELS
+from vertiwm_jax.terrain.patches import CELL_PIXELS
 
 LATENT_CHANNELS = 18
 _COARSE = 23

@@ -14,41 +14,38 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
 
-from vertiwm_jax.state import CELL_PIXELS
-from vertiwm_jax.terrain import crop, grid
-from vertiwm_jax.terrain.crop import PatchConfig
+from vertiwm_jax.terrain import grid, patches
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.patches import CELL_PIXELS, RELIEF_METRES
 
 _DIFFERENCES = np.array([[1, 0, 0], [-1, 1, 0], [1, -2, 1]])
 # Three heights h at 0, 1 and 2 are, between them, a0 + a1 x + a2 max(x - 1, 0), a = _DIFFERENCES h.
 _HINGES = np.kron(_DIFFERENCES, _DIFFERENCES).T.astype(np.float32)
 _BYTES = np.array([0, 8, 16])  # of red, green and blue in a colour
 _DRAWN_TOGETHER = 128  # cells with borders
-_SIDE = crop.PATCH_PIXELS // CELL_PIXELS // 2
-_FOURS = crop.CELLS_OF_PATCH.reshape(2, _SIDE, 2, _SIDE, 2).swapaxes(2, 3).reshape(2, -1)
+_SIDE = patches.PATCH_PIXELS // CELL_PIXELS // 2
+_FOURS = patches.CELLS_OF_PATCH.reshape(2, _SIDE, 2, _SIDE, 2).swapaxes(2, 3).reshape(2, -1)
 
 
-@partial(jax.jit, static_argnames="config", inline=True)
+@partial(jax.jit, inline=True)
 def projections(
     terrain: TerrainMap,
     position: jax.Array,
     yaw: jax.Array,
-    config: PatchConfig,
     of_elevation: jax.Array,
     of_colours: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Linear maps `[64, F]` and `[3, 64, F]` of every cell's pixels: `[8, 8, 4, F]` of each.
 
-    To rounding what they make of `crop.patches`, which has the other arguments. No gradient flows.
+    To rounding what they make of `patches.query`, which has the other arguments. No gradient flows.
     Cells come four by four, row by row of each 2 x 2, as encoders go on with them.
     """
     of_elevation, of_colours = jax.lax.stop_gradient((of_elevation, of_colours))
     position, yaw = jax.lax.stop_gradient((position, yaw))
-    level, relief = crop.scale(terrain, position, config)
-    middles, around = crop.places(terrain, position, yaw, _FOURS)
+    middles, around = patches.places(terrain, position, yaw, _FOURS)
 
     def of_pixels() -> tuple[jax.Array, jax.Array]:
-        elevation, rgb = crop.pixels(terrain, middles, around, level, relief, config)
+        elevation, rgb = patches.pixels(terrain, middles, around, position[2])
         return elevation @ of_elevation, jnp.einsum("ncp,cpf->nf", rgb, of_colours)
 
     def of_cells(*read: Any) -> tuple[jax.Array, jax.Array]:
@@ -57,10 +54,10 @@ def projections(
         of_each = _of_colours(colours[None], border[None], around[None], of_colours)
         return elevation @ of_elevation, of_each[0]
 
-    if config.interpolation == "bilinear" and _can_be_coarse(terrain):
+    if _can_be_coarse(terrain):
         # Operands of a branch are computed once, where fusion would repeat them for all pixels.
         operands = (
-            *_read_heights(terrain, middles, around, level, relief),
+            *_read_heights(terrain, middles, around, position[2]),
             *_read_colours(terrain, middles, around),
             around,
         )
@@ -88,7 +85,7 @@ def _is_coarse(terrain: TerrainMap) -> jax.Array:
     """`[]` whether no cell, however turned, reaches beyond 3 x 3 vertices or 2 x 2 classes."""
     vertices, classes = np.array(terrain.elevation.shape[1:]), np.array(terrain.semantic.shape[1:])
     spacing = float(np.min(np.append((vertices - 1) / classes, 1.0)))  # in units of the resolution
-    widest = np.sqrt(2) * (CELL_PIXELS - 1) * crop.PIXEL_METRES
+    widest = np.sqrt(2) * (CELL_PIXELS - 1) * patches.PIXEL_METRES
     return spacing * terrain.resolution > widest
 
 
@@ -101,8 +98,7 @@ def _read_heights(
     terrain: TerrainMap,
     middles: jax.Array,
     around: jax.Array,
-    level: jax.Array,
-    relief: jax.Array | float,
+    height: jax.Array,
 ) -> tuple[jax.Array, ...]:
     """The surface through the 3 x 3 vertices around each cell.
 
@@ -114,7 +110,7 @@ def _read_heights(
     first = jnp.minimum(_first(middles, around, last).astype(jnp.int32), last - 2)
     vertices = grid.flat_index(terrain, rows, columns, first[1], first[0])[:, None]
     vertices += (columns * np.arange(3)[:, None] + np.arange(3)).ravel()
-    heights = (grid.gather(terrain.elevation, vertices) - level) / relief
+    heights = (grid.gather(terrain.elevation, vertices) - height) / RELIEF_METRES
     surface = jnp.dot(heights, _HINGES, precision="highest")
     return surface, middles - first, jnp.float32(-first), jnp.float32(last - first)
 

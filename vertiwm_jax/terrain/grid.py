@@ -82,14 +82,6 @@ def _vertices(
     return jnp.where(known(terrain, belief, row, column), heights, guess)
 
 
-def nearest(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Array:
-    """Heights of the vertices next to fractional coordinates on the map, m."""
-    _, rows, columns = terrain.elevation.shape
-    nearest_row, nearest_column = (row + 0.5).astype(jnp.int32), (column + 0.5).astype(jnp.int32)
-    index = flat_index(terrain, rows, columns, nearest_row, nearest_column)
-    return _vertices(terrain, nearest_row, nearest_column, index)
-
-
 def bilinear(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Array:
     """Heights at fractional coordinates on the map, bilinear between vertices, m."""
     bottom_left, along, up, twist, fx, fy = corners(terrain, row, column)

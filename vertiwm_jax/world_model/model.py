@@ -335,16 +335,11 @@ class VertiWM:
         self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState
     ) -> tuple[Perception | Glance, Perception | Glance | None]:
         """What the Transformer sees at a state, and NeSAM if it has encoders of its own."""
-        first, second = self.transformer.exteroception, self.nesam.exteroception
+        look = self.transformer.exteroception.look
         of_first = self.transformer.view(params.transformer)
         if self.encoders == "shared":
-            return first.look((of_first,), terrain, state)[0], None
-        of_second = self.nesam.view(params.nesam)
-        if first == second:
-            by_transformer, by_nesam = first.look((of_first, of_second), terrain, state)
-        else:
-            (by_transformer,) = first.look((of_first,), terrain, state)
-            (by_nesam,) = second.look((of_second,), terrain, state)
+            return look((of_first,), terrain, state)[0], None
+        by_transformer, by_nesam = look((of_first, self.nesam.view(params.nesam)), terrain, state)
         return by_transformer, by_nesam
 
 

@@ -86,7 +86,7 @@ class Nesam:
     soil: whose parameters physics uses: those that the "map" has for each class of ground, or
         those "predicted" from what the ground at the vehicle looks like, the same for all wheels.
     exteroception: how it looks at patches.
-    remembers: what its history has of a look; to predict soils, or to tune encoders, the latents.
+    remembers: what its history has of a look; to predict soils, the latents.
     """
 
     size: TransformerSize = BASE
@@ -98,12 +98,8 @@ class Nesam:
     remembers: Remembers = "latents"
 
     def __post_init__(self) -> None:
-        all_needed = self.soil == "predicted" or self.exteroception.tune_encoders
-        if self.remembers == "glance" and all_needed:
-            raise ValueError(
-                "remembers: expected latents to predict soils, or with encoders that are tuned, "
-                "found glance"
-            )
+        if self.remembers == "glance" and self.soil == "predicted":
+            raise ValueError("remembers: expected latents to predict soils, found glance")
 
     def init_params(
         self,

@@ -10,10 +10,10 @@ from flax import struct
 
 from vertiwm_jax.dynamics import Dynamics, History, Params
 from vertiwm_jax.networks.encoder import Fours, TerrainEncoder, in_rows
-from vertiwm_jax.state import Command, Patches, VehicleState
-from vertiwm_jax.terrain import cells, crop
-from vertiwm_jax.terrain.crop import PATCH_PIXELS, PatchConfig
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain import cells, patches
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.patches import PATCH_PIXELS, Patches
 from vertiwm_jax.world_model.batching import few_at_a_time
 
 _ELEVATION, _SEMANTIC = TerrainEncoder(1), TerrainEncoder(3)
@@ -95,15 +95,7 @@ class View:
 
 @dataclass(frozen=True)
 class Exteroception:
-    """How a model looks at the ground: which patches, and encoders of its own.
-
-    patches: relative to the vehicle and bilinear by default, which keeps centimetres of relief
-        and does not know of heights above sea level; `PatchConfig()` is the paper's.
-    tune_encoders: whether gradients reach the encoders, which are frozen otherwise.
-    """
-
-    patches: PatchConfig = PatchConfig("vehicle", "bilinear")
-    tune_encoders: bool = False
+    """How a model looks at the ground, by encoders of its own, which are frozen."""
 
     def init_params(self, key: jax.Array) -> EncoderParams:
         """Untrained encoders."""
@@ -118,12 +110,8 @@ class Exteroception:
     ) -> tuple[Perception | Glance, ...]:
         """What models see at one vehicle's pose, all of the same patches.
 
-        The map counts as given, like the pose: unless encoders are tuned, no gradient flows, and
-        then latents are what is kept.
+        The map counts as given, like the pose: no gradient flows.
         """
-        if self.tune_encoders:
-            patches = self.query(terrain, state)
-            return tuple(self.encode(view.encoders, patches) for view in views)
         given = jax.lax.stop_gradient((views, terrain, state))
         return few_at_a_time(Exteroception._look, TOGETHER, self)(*given)
 
@@ -137,7 +125,7 @@ class Exteroception:
             for kind in ([p.elevation for p in encoders], [p.semantic for p in encoders])
         )
         projected = cells.projections(
-            terrain, state.position, state.rpy[2], self.patches, of_elevation[0], of_semantic
+            terrain, state.position, state.rpy[2], of_elevation[0], of_semantic
         )
         of_each = zip(*(jnp.split(x, len(views), axis=-1) for x in projected), strict=True)
         return tuple(
@@ -151,14 +139,13 @@ class Exteroception:
 
     def query(self, terrain: TerrainMap, state: VehicleState) -> Patches:
         """The patches at one vehicle's pose, which counts as given: Q(M; sg(T))."""
-        return crop.patches(terrain, state.position, state.rpy[2], self.patches)
+        return patches.query(terrain, state.position, state.rpy[2])
 
-    def encode(self, params: EncoderParams, patches: Patches) -> Perception:
+    def encode(self, params: EncoderParams, seen: Patches) -> Perception:
         """Patches to their latents (Eq. 2)."""
-        if not self.tune_encoders:
-            params = jax.lax.stop_gradient(params)
-        elevation = _ELEVATION.apply(params.elevation, patches.elevation[..., None])
-        semantic = _SEMANTIC.apply(params.semantic, patches.rgb)
+        params = jax.lax.stop_gradient(params)
+        elevation = _ELEVATION.apply(params.elevation, seen.elevation[..., None])
+        semantic = _SEMANTIC.apply(params.semantic, seen.rgb)
         return Perception(cast(jax.Array, elevation), cast(jax.Array, semantic))
 
 

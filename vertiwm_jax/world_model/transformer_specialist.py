@@ -61,12 +61,8 @@ class TransformerSpecialist:
     remembers: Remembers = "latents"
 
     def __post_init__(self) -> None:
-        all_needed = self.terrain != "patches" or self.exteroception.tune_encoders
-        if self.remembers == "glance" and all_needed:
-            raise ValueError(
-                "remembers: expected latents without patches, or with encoders that are tuned, "
-                "found glance"
-            )
+        if self.remembers == "glance" and self.terrain != "patches":
+            raise ValueError("remembers: expected latents without patches, found glance")
 
     def init_params(
         self, key: jax.Array, normalisation: Normalisation | None = None

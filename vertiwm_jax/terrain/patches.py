@@ -1,28 +1,37 @@
-"""Vehicle-aligned patches of the map, in the order in which encoders read them.
+"""The query Q of the map: patches of the ground about a vehicle, as encoders read them."""
 
-That is cell by cell of 8 x 8 pixels. `cells` has what linear maps make of these, which takes a CPU
-a fraction of the time.
-"""
-
-from dataclasses import dataclass
 from functools import partial
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
-from vertiwm_jax.state import CELL_PIXELS, STEP_SECONDS, Patches
+from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import grid
 from vertiwm_jax.terrain.map import TerrainMap
 
 PATCH_PIXELS = 128
 PATCH_METRES = 12.8
+CELL_PIXELS = 8
+"""Side of the squares of pixels that encoders read one by one; a patch has 16 x 16 of them."""
 RELIEF_METRES = 4.0
-"""Height above or below the vehicle that is 1 in patches relative to it."""
+"""Height above or below the vehicle that is 1 in a patch."""
 PIXEL_METRES = PATCH_METRES / PATCH_PIXELS
 
 _CELLS = PATCH_PIXELS // CELL_PIXELS
+
+
+@struct.dataclass
+class Patches:
+    """Vehicle-aligned observations of the ground, m_t of the paper, in [-1, 1].
+
+    elevation: `[..., 128, 128]`; row 0 is farthest ahead, column 0 farthest left.
+    rgb: `[..., 128, 128, 3]` semantic colours, same pixels.
+    """
+
+    elevation: jax.Array
+    rgb: jax.Array
 
 
 def _square(number: int, metres: float) -> np.ndarray:
@@ -36,47 +45,21 @@ CELLS_OF_PATCH = _square(_CELLS, CELL_PIXELS * PIXEL_METRES)
 _PIXELS_OF_CELL = _square(CELL_PIXELS, PIXEL_METRES)
 
 
-@dataclass(frozen=True)
-class PatchConfig:
-    """How heights become elevation patches.
-
-    reference: "map" scales the map's `elevation_range` to [-1, 1], as the paper does; "vehicle"
-        takes heights above the body origin, over `RELIEF_METRES`, which do not change when map
-        and vehicle are lifted together.
-    interpolation: "nearest" vertex, as in the paper, which draws a coarse grid as stairs; or
-        "bilinear" between vertices.
-    """
-
-    reference: Literal["map", "vehicle"] = "map"
-    interpolation: Literal["nearest", "bilinear"] = "nearest"
-
-
-@partial(jax.jit, static_argnames="config", inline=True)
-def patches(
-    terrain: TerrainMap, position: jax.Array, yaw: jax.Array, config: PatchConfig = PatchConfig()
-) -> Patches:
-    """What one vehicle at `[3]` p_world (m) and `[]` yaw (rad) sees, in [-1, 1] (Eq. 1's m_t).
+@partial(jax.jit, inline=True)
+def query(terrain: TerrainMap, position: jax.Array, yaw: jax.Array) -> Patches:
+    """What one vehicle at `[3]` p_world (m) and `[]` yaw (rad) sees.
 
     Pixels are 0.1 m, row 0 farthest ahead, column 0 farthest left, the vehicle midway between
-    the four central ones; each has the colour of its cell. Pixels off the map take the nearest
-    edge; a NaN x, y or yaw sees vertex (0, 0) in every pixel, a NaN height NaN elevations where
-    they are relative to it. No gradient flows to the pose: it counts as given. Batch with `vmap`,
-    selecting each vehicle's world inside.
+    the four central ones. Elevations are bilinear between vertices and count from the body origin,
+    over `RELIEF_METRES`, so they do not change when map and vehicle are lifted together. The paper
+    reads the nearest vertex and scales by the range of the whole map. Each pixel has the color of
+    its class. Pixels off the map take the nearest edge. A NaN x, y or yaw sees vertex (0, 0) in
+    every pixel; a NaN height gives NaN elevations. No gradient flows to the pose. Batch with
+    `vmap`, selecting each vehicle's world inside.
     """
     position, yaw = jax.lax.stop_gradient((position, yaw))
-    level, relief = scale(terrain, position, config)
-    elevation, rgb = pixels(terrain, *places(terrain, position, yaw), level, relief, config)
+    elevation, rgb = pixels(terrain, *places(terrain, position, yaw), position[2])
     return Patches(_image(elevation[:, None])[..., 0], _image(rgb))
-
-
-def scale(
-    terrain: TerrainMap, position: jax.Array, config: PatchConfig
-) -> tuple[jax.Array, jax.Array | float]:
-    """The height that is 0 in a patch, and how far above it 1 is, m."""
-    if config.reference == "map":
-        low, high = terrain.elevation_range
-        return (low + high) / 2, (high - low) / 2
-    return position[2], RELIEF_METRES
 
 
 def places(
@@ -98,17 +81,11 @@ def places(
 
 
 def pixels(
-    terrain: TerrainMap,
-    middles: jax.Array,
-    around: jax.Array,
-    level: jax.Array,
-    relief: jax.Array | float,
-    config: PatchConfig,
+    terrain: TerrainMap, middles: jax.Array, around: jax.Array, height: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Elevations `[256, 64]` and colours `[256, 3, 64]` of all pixels, at `places`, by `scale`."""
+    """Elevations `[256, 64]` above a height `[]`, m, and colors `[256, 3, 64]`, at `places`."""
     column, row = grid.on_map(terrain, *(middles[:, :, None] + around[:, None]))
-    read = grid.nearest if config.interpolation == "nearest" else grid.bilinear
-    elevation = jnp.clip((read(terrain, row, column) - level) / relief, -1, 1)
+    elevation = jnp.clip((grid.bilinear(terrain, row, column) - height) / RELIEF_METRES, -1, 1)
     semantic = grid.classes(terrain, row, column, grid.cell_index(terrain, row, column))
     palette = terrain.class_rgb / 127.5 - 1
     return elevation, jnp.stack([grid.gather(c, semantic) for c in palette.T], axis=1)

@@ -1,18 +1,15 @@
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vertiwm_jax.terrain import crop
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain import patches
 from vertiwm_jax.terrain.classes import STANDARD
-from vertiwm_jax.terrain.crop import PatchConfig
 
 CONCRETE, GRASS = STANDARD.names.index("concrete"), STANDARD.names.index("grass")
-PAPER, RELATIVE = PatchConfig(), PatchConfig("vehicle", "bilinear")
 
 
 @pytest.fixture(scope="module")
@@ -32,20 +29,21 @@ def terrain():
     )
 
 
-@partial(jax.jit, static_argnums=4)
-def patches_of(terrain, world, position, yaw, config=PAPER):
-    return crop.patches(terrain.select(world), position, yaw, config)
+@jax.jit
+def patches_of(terrain, world, position, yaw):
+    return patches.query(terrain.select(world), position, yaw)
 
 
 def bilinear(z, u, v):
     """Heights between the four vertices around column u, row v, in double precision."""
-    c, r = np.minimum(u.astype(int), z.shape[1] - 2), np.minimum(v.astype(int), z.shape[0] - 2)
+    c = np.minimum(np.asarray(u).astype(int), z.shape[1] - 2)
+    r = np.minimum(np.asarray(v).astype(int), z.shape[0] - 2)
     f, g = u - c, v - r
     top, bottom = (z[i, c] * (1 - f) + z[i, c + 1] * f for i in (r, r + 1))
     return top * (1 - g) + bottom * g
 
 
-def reference_patches(terrain, world, x, y, yaw):
+def reference_patches(terrain, world, x, y, height, yaw):
     z, semantic = np.asarray(terrain.elevation[world], float), np.asarray(terrain.semantic[world])
     x0, y0 = np.asarray(terrain.origin, float)
     step = float(terrain.resolution)
@@ -57,7 +55,7 @@ def reference_patches(terrain, world, x, y, yaw):
             py = y + np.sin(yaw) * ahead + np.cos(yaw) * left
             u = np.clip((px - x0) / step, 0, z.shape[1] - 1)
             v = np.clip((y0 - py) / step, 0, z.shape[0] - 1)
-            elevation[row, column] = z[int(v + 0.5), int(u + 0.5)] / 16 * 2 - 1
+            elevation[row, column] = (bilinear(z, u, v) - height) / 4
             i = min(int(v / (z.shape[0] - 1) * semantic.shape[0]), semantic.shape[0] - 1)
             j = min(int(u / (z.shape[1] - 1) * semantic.shape[1]), semantic.shape[1] - 1)
             rgb[row, column] = STANDARD.rgb[semantic[i, j]] / 255.0 * 2 - 1
@@ -67,10 +65,10 @@ def reference_patches(terrain, world, x, y, yaw):
 @pytest.mark.parametrize("pose", [(1.3, 2.7, 0.6), (-6.0, 10.0, -2.2)])
 def test_patches_equal_a_plain_loop(terrain, pose):
     x, y, yaw = pose
-    found = patches_of(terrain, 1, jnp.array([x, y, 0.0]), jnp.float32(yaw))
-    elevation, rgb = reference_patches(terrain, 1, x, y, yaw)
+    found = patches_of(terrain, 1, jnp.array([x, y, 0.7]), jnp.float32(yaw))
+    elevation, rgb = reference_patches(terrain, 1, x, y, 0.7, yaw)
+    np.testing.assert_allclose(found.elevation, elevation, atol=1e-5)
     # Pixels on a rounding border may fall either way in float32.
-    assert np.mean(np.abs(found.elevation - elevation) > 1e-5) < 1e-3
     assert np.mean(np.abs(found.rgb - rgb).max(-1) > 1e-5) < 1e-3
 
 
@@ -83,7 +81,7 @@ def test_patches_show_bump_and_colour_where_they_are(eighth):
     axis = np.arange(129) * 0.25 - 16
     x, y = axis[None, :], -axis[:, None]
     bump, spot = vehicle + 4 * forward, vehicle + 4 * left
-    elevation = 16 * np.exp(-((x - bump[0]) ** 2 + (y - bump[1]) ** 2))
+    elevation = 4 * np.exp(-((x - bump[0]) ** 2 + (y - bump[1]) ** 2))
     cell = np.arange(128) * 0.25 - 15.875
     near = np.hypot(cell[None, :] - spot[0], -cell[:, None] - spot[1]) < 0.8
     terrain = terrain_map.build(elevation, np.where(near, CONCRETE, GRASS), resolution=0.25)
@@ -100,7 +98,7 @@ def test_patches_show_bump_and_colour_where_they_are(eighth):
 def test_patches_are_bounded_and_batch_over_worlds(terrain):
     position = jnp.array([[0.0, 0.0, 0.0], [100.0, -100.0, 0.0], [-1e9, 3.0, 0.0]])
     axes = (None, 0, 0, 0)
-    batched = jax.jit(jax.vmap(lambda t, w, p, a: crop.patches(t.select(w), p, a), axes))
+    batched = jax.jit(jax.vmap(lambda t, w, p, a: patches.query(t.select(w), p, a), axes))
     found = batched(terrain, jnp.array([0, 1, 2]), position, jnp.zeros(3))
     assert found.elevation.shape == (3, 128, 128) and found.rgb.shape == (3, 128, 128, 3)
     for world in range(3):
@@ -108,23 +106,22 @@ def test_patches_are_bounded_and_batch_over_worlds(terrain):
         np.testing.assert_array_equal(found.elevation[world], alone.elevation)
         np.testing.assert_array_equal(found.rgb[world], alone.rgb)
     # Far off the map, every pixel is its nearest corner.
-    np.testing.assert_allclose(found.elevation[1], terrain.elevation[1, -1, -1] / 8 - 1, atol=1e-6)
+    np.testing.assert_allclose(found.elevation[1], terrain.elevation[1, -1, -1] / 4, atol=1e-6)
     assert np.abs(found.elevation).max() <= 1 and np.abs(found.rgb).max() <= 1
 
 
 @pytest.mark.parametrize("resolution", [0.5, 1.0])
-@pytest.mark.parametrize("config", [PAPER, PatchConfig("map", "bilinear")])
 @pytest.mark.parametrize("pose", [(np.nan, np.nan, 0.0), (0.0, 0.0, np.nan)])
-def test_nan_pose_sees_the_first_vertex(terrain, pose, config, resolution):
+def test_nan_pose_sees_the_first_vertex(terrain, pose, resolution):
     terrain = replace(terrain, resolution=jnp.float32(resolution))
-    found = patches_of(terrain, 2, jnp.array([*pose[:2], 0.0]), jnp.float32(pose[2]), config)
-    np.testing.assert_allclose(found.elevation, terrain.elevation[2, 0, 0] / 8 - 1, atol=1e-6)
+    found = patches_of(terrain, 2, jnp.array([*pose[:2], 0.0]), jnp.float32(pose[2]))
+    np.testing.assert_allclose(found.elevation, terrain.elevation[2, 0, 0] / 4, atol=1e-6)
     assert np.isfinite(found.rgb).all()
 
 
 def test_no_gradient_flows_from_patches_to_the_pose(terrain):
     def total(position, yaw):
-        found = crop.patches(terrain, position, yaw, RELATIVE)
+        found = patches.query(terrain, position, yaw)
         return found.elevation.sum() + found.rgb.sum()
 
     slopes = jax.grad(total, (0, 1))(jnp.array([1.0, 2.0, 1.5]), jnp.float32(0.3))
@@ -149,7 +146,7 @@ def test_bilinear_patches_relative_to_the_vehicle(resolution, vertices_a_class, 
     terrain = terrain_map.build(heights, kinds, resolution=resolution, origin=(-7.0, 11.0))
 
     x, y, z, yaw = pose
-    found = patches_of(terrain, 0, jnp.array([x, y, z]), jnp.float32(yaw), RELATIVE)
+    found = patches_of(terrain, 0, jnp.array([x, y, z]), jnp.float32(yaw))
     place = 6.35 - 0.1 * np.arange(128)
     ahead, left = place[:, None], place[None, :]
     px = x + np.cos(yaw) * ahead - np.sin(yaw) * left
@@ -164,36 +161,24 @@ def test_bilinear_patches_relative_to_the_vehicle(resolution, vertices_a_class, 
     # Pixels on a rounding border may fall either way in float32.
     colours = STANDARD.rgb[kinds[i, j]] / 255.0 * 2 - 1
     assert np.mean(np.abs(found.rgb - colours).max(-1) > 1e-5) < 1e-3
-    paper = patches_of(terrain, 0, jnp.array([x, y, z]), jnp.float32(yaw))
-    assert np.mean(np.abs(found.rgb - paper.rgb).max(-1) > 1e-5) < 1e-3
 
 
 def test_patches_of_the_smallest_map():
     terrain = terrain_map.build(np.array([[0.0, 1.0], [2.0, 3.0]]), np.array([[CONCRETE]]))
-    found = patches_of(terrain, 0, jnp.zeros(3), jnp.float32(0), RELATIVE)
+    found = patches_of(terrain, 0, jnp.zeros(3), jnp.float32(0))
     corners = found.elevation[jnp.array([0, 0, -1, -1]), jnp.array([0, -1, 0, -1])]
     np.testing.assert_allclose(4 * corners, [1, 3, 0, 2], atol=1e-6)  # ahead is to the right
 
 
-@pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
-def test_references_differ_by_the_height_of_the_vehicle_and_the_scale(terrain, interpolation):
-    position = jnp.array([2.0, 1.0, 1.5])
-    by_map, by_vehicle = (
-        patches_of(terrain, 0, position, 0.4, PatchConfig(reference, interpolation)).elevation
-        for reference in ("map", "vehicle")
-    )
-    np.testing.assert_allclose(4 * by_vehicle + 1.5, 8 * (by_map + 1), atol=1e-5)
-
-
 def test_ground_far_above_or_below_the_vehicle_is_cut_off(terrain):
     for height, expected in ((30.0, -1), (-30.0, 1)):
-        found = patches_of(terrain, 0, jnp.array([0.0, 0.0, height]), 0.0, RELATIVE)
+        found = patches_of(terrain, 0, jnp.array([0.0, 0.0, height]), 0.0)
         np.testing.assert_array_equal(found.elevation, expected)
 
 
 def test_footprint_must_fit_the_patch():
-    crop.footprint_covered(2.4, 8.0)
+    patches.footprint_covered(2.4, 8.0)
     with pytest.raises(ValueError, match=r"12.8 m .* found .*6\.9 m > 6\.4 m; keep the top speed"):
-        crop.footprint_covered(2.4, 45.0)
+        patches.footprint_covered(2.4, 45.0)
     with pytest.raises(ValueError, match="patch"):
-        crop.footprint_covered(float("nan"), 4.0)
+        patches.footprint_covered(float("nan"), 4.0)
