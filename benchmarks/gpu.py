@@ -4,7 +4,7 @@ What is found is written to one JSON file after each case, so that a run that is
 what it has. A case that fails is one line there, and in the end a status that is not 0.
 
 One device does it, the first that JAX finds, which has to find the CPU beside it: `JAX_PLATFORMS`
-is unset, or `cuda,cpu`. `--small` tries everything in tiny sizes, on a CPU too. docs/performance.md
+is unset, or `cuda,cpu`. `--small` tries everything in tiny sizes, on a CPU too. docs/scaling.md
 says how to run it where there is no network.
 """
 

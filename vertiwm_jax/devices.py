@@ -41,7 +41,7 @@ def use_cores() -> None:
     """Makes every core of a CPU a device, unless `JAX_NUM_CPU_DEVICES` sets their number.
 
     Two devices of one core each are faster than one of two cores, whose cores wait for each other
-    after every operation (docs/performance.md). `RuntimeError` where JAX has started already with
+    after every operation (docs/scaling.md). `RuntimeError` where JAX has started already with
     another number of them.
     """
     # Where another program takes one core, the others wait; after 60 s XLA would end the process.
