@@ -173,9 +173,9 @@ def test_without_knowing_the_ground_the_way_is_straight():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"cells": 3}, "route.cells: expected at least 4, found 3"),
-        ({"detour": -1.0}, "route.detour: expected at least 0, found -1.0"),
-        ({"blocked": np.nan}, "route.blocked: expected at least 0, found nan"),
+        ({"cells": 3}, "cells: expected at least 4, found 3"),
+        ({"detour": -1.0}, "detour: expected at least 0, found -1.0"),
+        ({"blocked": np.nan}, "blocked: expected at least 0, found nan"),
     ],
 )
 def test_settings_that_cannot_be(settings, message):

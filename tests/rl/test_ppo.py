@@ -181,11 +181,11 @@ def test_what_is_learned_from_is_what_was_seen():
     assert np.ptp(actions) > 0.1
 
 
-@pytest.mark.parametrize("parts", [0, 3, 256])
-def test_parts_must_divide_the_minibatch(parts):
-    with pytest.raises(
-        ValueError, match=f"accumulate: expected a divisor of .* 128, found {parts}"
-    ):
+@pytest.mark.parametrize(
+    ("parts", "expected"), [(0, "at least 1"), (3, "a divisor of .* 128"), (256, "a divisor of")]
+)
+def test_parts_must_divide_the_minibatch(parts, expected):
+    with pytest.raises(ValueError, match=f"accumulate: expected {expected}.*, found {parts}"):
         PPOConfig(**{**vars(CONFIG), "accumulate": parts})
 
 

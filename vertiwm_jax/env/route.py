@@ -6,8 +6,8 @@ obstacle stands. Costs to go are those of the cheapest way (Bellman's equation, 
 """
 
 import functools
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import replace
+from typing import Annotated, Self
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax import devices
+from vertiwm_jax.config import Bounds, NotNegative, settings
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.footprint import Difficulty, footprint, places
 from vertiwm_jax.env.termination import edge_distance
@@ -31,7 +32,7 @@ _REACH = 2  # cells, of the longest moves along an axis
 _NEAR = 1.5  # cells from a goal within which the way to it is straight
 
 
-@dataclass(frozen=True)
+@settings
 class RouteConfig:
     """How ways to goals are weighed where the map is known; static.
 
@@ -41,17 +42,10 @@ class RouteConfig:
     blocked: the same of a metre in which an obstacle, or the edge of the map, is touched.
     """
 
-    cells: int = 64
+    cells: Annotated[int, Bounds(4)] = 64
     difficulty: Difficulty = Difficulty()
-    detour: float = 2.0
-    blocked: float = 10.0
-
-    def __post_init__(self) -> None:
-        if self.cells < 4:
-            raise ValueError(f"route.cells: expected at least 4, found {self.cells}")
-        for name in ("detour", "blocked"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"route.{name}: expected at least 0, found {getattr(self, name)}")
+    detour: NotNegative = 2.0
+    blocked: NotNegative = 10.0
 
 
 @struct.dataclass

@@ -9,6 +9,7 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax import devices
+from vertiwm_jax.config import Count, NotNegative, settings
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.networks.encoder import TerrainAutoencoder
@@ -21,23 +22,16 @@ _ELEVATION, _SEMANTIC = TerrainAutoencoder(1), TerrainAutoencoder(3)
 _NETWORKS = {"elevation": _ELEVATION, "semantic": _SEMANTIC}
 
 
-@dataclass(frozen=True)
+@settings
 class AutoencoderConfig:
     """Which patches a pair of autoencoders is trained on."""
 
-    batch: int = 16
+    batch: Count = 16
     """Patches in a batch."""
-    offset: float = 20.0
+    offset: NotNegative = 20.0
     """How far from a recorded place patches are taken, m, along x and y; their yaw is any."""
-    validation: int = 256
+    validation: Count = 256
     """Patches to validate on, at recorded poses."""
-
-    def __post_init__(self):
-        for name in ("batch", "validation"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
-        if self.offset < 0:
-            raise ValueError(f"offset: expected at least 0 m, found {self.offset}")
 
 
 @struct.dataclass

@@ -14,6 +14,7 @@ import optax
 from flax import struct
 
 from vertiwm_jax import checkpoints, training
+from vertiwm_jax.config import Count, CountOrZero, NotNegative, Positive, settings
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.runs import Run
 from vertiwm_jax.training import CheckpointConfig, Work
@@ -45,33 +46,30 @@ class Problem(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@settings
 class FitConfig:
     """How parameters are fitted."""
 
-    updates: int = 10_000
+    updates: CountOrZero = 10_000
     """Optimiser steps (AdamW), each on a batch, or batches, of its own; 0 leaves the stage out."""
-    updates_per_iteration: int = 100
+    updates_per_iteration: Count = 100
     """Updates between two validations, in one compiled call."""
-    accumulate: int = 1
+    accumulate: Count = 1
     """Batches whose gradients make one update: a larger batch in the memory of one."""
-    learning_rate: float = 1e-3
+    learning_rate: Positive = 1e-3
     """The highest; it rises linearly to it and falls as a cosine."""
     warm_up: int = 200
     """Updates until the highest learning rate."""
-    weight_decay: float = 1e-4
+    weight_decay: NotNegative = 1e-4
     """Decay of all trained parameters, also of those without a gradient, times learning rate."""
-    max_gradient_norm: float = 1.0
+    max_gradient_norm: Positive = 1.0
     """Gradients are clipped to this global norm."""
     trainable: tuple[str, ...] = ()
     """Entries of the parameters that are trained, dotted like "gate.network"; all when empty."""
     checkpoints: CheckpointConfig = CheckpointConfig(checkpoint_every=5, keep=1)
     """What is kept of the training."""
 
-    def __post_init__(self):
-        for name, least in {"updates": 0, "updates_per_iteration": 1, "accumulate": 1}.items():
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected at least {least}, found {getattr(self, name)}")
+    def check(self):
         if self.updates % self.updates_per_iteration:
             raise ValueError(
                 f"updates: expected a multiple of updates_per_iteration, "
@@ -81,9 +79,6 @@ class FitConfig:
             raise ValueError(
                 f"warm_up: expected 0 to {self.updates - 1} updates, found {self.warm_up}"
             )
-        for name in ("learning_rate", "max_gradient_norm"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name}: expected more than 0, found {getattr(self, name)}")
 
 
 @struct.dataclass

@@ -1,32 +1,24 @@
 """What a prediction is fitted by: the trajectory loss of the paper, and a one-step loss."""
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 
 from vertiwm_jax import geometry
+from vertiwm_jax.config import NotNegative, Positive, settings
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.world_model import motion
 
 
-@dataclass(frozen=True)
+@settings
 class LossConfig:
     """The trajectory loss (Eq. 11)."""
 
-    epsilon: float = 1e-3
+    epsilon: Positive = 1e-3
     """Error, m or rad, below which the loss turns from linear to quadratic."""
-    coefficient_change: float = 0.01
+    coefficient_change: NotNegative = 0.01
     """Weight of the change of fusion coefficients between steps (the paper's lambda_alpha)."""
-    velocity: float = 0.0
+    velocity: NotNegative = 0.0
     """Weight of velocity (m/s) and angular velocity (rad/s), which Eq. 11 leaves out."""
-
-    def __post_init__(self):
-        if self.epsilon <= 0:
-            raise ValueError(f"epsilon: expected more than 0, found {self.epsilon}")
-        for name in ("coefficient_change", "velocity"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name}: expected at least 0, found {getattr(self, name)}")
 
 
 def trajectory_loss(

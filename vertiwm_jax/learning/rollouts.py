@@ -10,6 +10,7 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax import devices
+from vertiwm_jax.config import Count, CountOrZero, NotNegative, settings
 from vertiwm_jax.dynamics import Dynamics, History, Params, warm_up
 from vertiwm_jax.learning import augment, windows
 from vertiwm_jax.learning.dataset import Drives
@@ -21,32 +22,24 @@ from vertiwm_jax.terrain.map import TerrainMap
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
+@settings
 class WindowConfig:
     """Which windows a model is fitted to and validated on."""
 
-    batch: int = 64
+    batch: Count = 64
     """Windows in a batch."""
-    context: int = 16
+    context: CountOrZero = 16
     """Recorded steps that a model sees first."""
-    horizon: int = 16
+    horizon: Count = 16
     """Steps that it predicts."""
-    stride: int = 4
+    stride: Count = 4
     """Steps from one window to the next."""
-    weights: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    weights: tuple[NotNegative, NotNegative, NotNegative] = (1.0, 1.0, 1.0)
     """How often a window on rigid ground, on soil and across both is drawn, relatively."""
     mirror: bool = True
     """Whether half of those drawn are replaced by their mirror images."""
-    validation: int = 256
+    validation: Count = 256
     """Largest number of windows of each kind of ground to validate on."""
-
-    def __post_init__(self):
-        least = {"batch": 1, "context": 0, "horizon": 1, "stride": 1, "validation": 1}
-        for name, lowest in least.items():
-            if getattr(self, name) < lowest:
-                raise ValueError(f"{name}: expected at least {lowest}, found {getattr(self, name)}")
-        if min(self.weights) < 0:
-            raise ValueError(f"weights: expected at least 0, found {self.weights}")
 
 
 @struct.dataclass

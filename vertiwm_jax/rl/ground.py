@@ -1,14 +1,15 @@
 """Which worlds to train on, which to keep for the test, and the tasks on both."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, NotNegative, settings
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.tasks import Tasks, circle_tasks, random_tasks
 from vertiwm_jax.terrain import files, vertibench, worlds
@@ -24,32 +25,28 @@ SUITES: dict[Suite, WorldConfig] = {
 """Procedural worlds to test on; Verti-Bench's have 10, 20 or 40 rocks and a tree for each ten."""
 
 
-@dataclass(frozen=True)
+@settings
 class GroundConfig:
     """Where policies learn and where they are tested."""
 
     training: WorldConfig = WorldConfig(("mid", "high"), rocks=20, trees=2, obstructed=0.5)
     """Procedural worlds to train on, unless maps are given; low ones teach little."""
-    train_worlds: int = 180
+    train_worlds: Count = 180
     """How many of them."""
-    suites: tuple[Suite, ...] = ("easy", "hard", "obstacles")
+    suites: Annotated[tuple[Suite, ...], AtLeastOne] = ("easy", "hard", "obstacles")
     """Procedural worlds to test on, unless maps are given."""
-    suite_worlds: int = 6
+    suite_worlds: Count = 6
     """How many of each suite."""
-    held_out_every: int = 5
+    held_out_every: CountOrZero = 5
     """Of given maps, every so-manieth is not trained on but tested on."""
-    starts: int = 1024
+    starts: CountOrZero = 1024
     """Random tasks to train on, beside those across the circle of every world."""
-    pairs: int = 10
+    pairs: Count = 10
     """Tasks across the circle of a world."""
-    sway: float = 0.25
+    sway: NotNegative = 0.25
     """How far, rad, each of them may turn to a more level start; 0 is Verti-Bench's circle."""
     obstacles: bool = False
     """Whether the rocks and trees of given maps stand there; without them as in the paper."""
-
-    def __post_init__(self):
-        if not self.suites:
-            raise ValueError(f"suites: expected some of {', '.join(SUITES)}, found none")
 
 
 def grounds(

@@ -1,27 +1,23 @@
 """Planning without a learned policy: model predictive path integral control."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from vertiwm_jax.config import Positive, settings
 from vertiwm_jax.env.episode import NavigationParams, NavigationState
 from vertiwm_jax.rl.imagining import Plan, around
 from vertiwm_jax.rl.open_loop import OpenLoop, OpenLoopConfig
 
 
-@dataclass(frozen=True)
+@settings
 class MPPIConfig(OpenLoopConfig):
     """What `MPPI` imagines before it decides, and what it makes of it."""
 
-    temperature: float = 30.0
+    temperature: Positive = 30.0
     """Reward by which a plan must be worse to count e times less."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.temperature <= 0:
-            raise ValueError(f"temperature: expected more than 0, found {self.temperature}")
 
 
 @struct.dataclass

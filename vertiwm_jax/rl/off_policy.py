@@ -15,6 +15,7 @@ from flax import struct
 from gymnax.environments.environment import Environment
 
 from vertiwm_jax import devices
+from vertiwm_jax.config import Count, NotNegative, Share, settings
 from vertiwm_jax.networks.policy import ActionCritic, Senses, SquashedActor, twin_values
 from vertiwm_jax.rl import environments
 from vertiwm_jax.rl.environments import Environments, Experience, Metrics, Outcomes
@@ -46,33 +47,27 @@ class Twins(Protocol):
 Learner = TypeVar("Learner", bound=Twins)
 
 
-@dataclass(frozen=True)
+@settings
 class OffPolicyConfig(LearningConfig):
     """Settings of an algorithm with a replay buffer; its learning rate is constant."""
 
-    updates: int = 8
+    updates: Count = 8
     """Gradient steps after every step of all environments."""
-    batch: int = 512
+    batch: Count = 512
     """Transitions in a gradient step."""
-    capacity: int = 131_072
+    capacity: Count = 131_072
     """Transitions that the replay buffer holds; a multiple of num_envs."""
     warm_up: int = 8_192
     """Transitions by random actions before anything is learned."""
-    target_rate: float = 0.005
+    target_rate: Share = 0.005
     """Share of the critics that the target critics take over in a gradient step (tau), and of the
     actor that its average does."""
-    restraint: float = 0.1
+    restraint: NotNegative = 0.1
     """What the square of actions costs the actor, in units of the mean size of values. Without it
     actors run to the limits of their actions before critics know what those are worth."""
 
-    def __post_init__(self):
-        super().__post_init__()
-        if self.restraint < 0:
-            raise ValueError(f"restraint: expected at least 0, found {self.restraint}")
-        for name in ("updates", "batch"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
-        if self.capacity < 1 or self.capacity % self.num_envs:
+    def check(self):
+        if self.capacity % self.num_envs:
             raise ValueError(
                 f"capacity: expected a multiple of num_envs, {self.num_envs}, found {self.capacity}"
             )

@@ -1,46 +1,34 @@
 """What planners without a learned policy share: plans of decisions, and what a plan is worth."""
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from vertiwm_jax.config import Count, Discount, NotNegative, Positive, settings
 from vertiwm_jax.env.episode import NavigationParams, NavigationState
 from vertiwm_jax.rl.imagining import Future, Imagining, Plan
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.world_model.choice import Imagined
 
 
-@dataclass(frozen=True)
+@settings
 class OpenLoopConfig:
     """What a planner imagines before it decides."""
 
-    candidates: int = 64
+    candidates: Count = 64
     """Plans compared at every decision; the first is what was intended anyway."""
-    decisions: int = 6
+    decisions: Count = 6
     """Decisions in a plan."""
-    interval: int = 8
+    interval: Count = 8
     """Steps of 0.1 s that a decision is held."""
-    spread: float = 0.5
+    spread: NotNegative = 0.5
     """Standard deviation of the other plans about it, in units of half the action range."""
-    discount: float = 0.98
+    discount: Discount = 0.98
     """Of rewards, for each decision."""
-    pace: float = 3.0
+    pace: Positive = 3.0
     """Speed, m/s, at which costs to go are expected to fall where a plan ends."""
     model: Imagined = "nesam"
     """What it imagines in: NeSAM predicts as well as the whole Verti-WM, many times faster."""
-
-    def __post_init__(self):
-        for name in ("candidates", "decisions", "interval"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
-        if self.spread < 0:
-            raise ValueError(f"spread: expected at least 0, found {self.spread}")
-        if self.pace <= 0:
-            raise ValueError(f"pace: expected more than 0, found {self.pace}")
-        if not 0 < self.discount < 1:
-            raise ValueError(f"discount: expected between 0 and 1, found {self.discount}")
 
 
 @struct.dataclass

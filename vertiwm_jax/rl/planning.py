@@ -1,11 +1,12 @@
 """Decision-time planning: a learned policy, improved by imagining what its actions lead to."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from vertiwm_jax.config import Count, NotNegative, settings
 from vertiwm_jax.env.episode import NavigationParams, NavigationState
 from vertiwm_jax.env.repeat import Controller
 from vertiwm_jax.rl.imagining import Future, Imagining, Plan, around
@@ -13,25 +14,18 @@ from vertiwm_jax.rl.learned import MeanAction, TwinValue, Value
 from vertiwm_jax.world_model.choice import ModelName
 
 
-@dataclass(frozen=True)
+@settings
 class PlanningConfig:
     """How far a driver looks ahead before it decides."""
 
-    candidates: int = 8
+    candidates: Count = 8
     """Actions compared at every decision; the first is what the policy does anyway."""
-    decisions: int = 4
+    decisions: Count = 4
     """Decisions imagined of each: the candidate, then those of the policy."""
-    spread: float = 0.4
+    spread: NotNegative = 0.4
     """Standard deviation of the other candidates about it, in units of half the action range."""
     model: ModelName = "nesam"
     """What it imagines in: NeSAM predicts as well as the whole Verti-WM, many times faster."""
-
-    def __post_init__(self):
-        for name in ("candidates", "decisions"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
-        if self.spread < 0:
-            raise ValueError(f"spread: expected at least 0, found {self.spread}")
 
 
 @struct.dataclass

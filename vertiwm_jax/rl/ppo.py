@@ -17,6 +17,7 @@ from flax import struct
 from gymnax.environments.environment import Environment
 
 from vertiwm_jax import devices
+from vertiwm_jax.config import Count, NotNegative, Positive, Share, settings
 from vertiwm_jax.networks.policy import Actor, Critic, Gaussian, Senses
 from vertiwm_jax.rl import environments
 from vertiwm_jax.rl.advantages import generalised_advantages
@@ -29,41 +30,39 @@ from vertiwm_jax.training import all_finite, mean_in_turns
 Params = Any
 
 
-@dataclass(frozen=True)
+@settings
 class PPOConfig(LearningConfig):
     """Settings of PPO; the defaults suit the navigation task on the built-in simulator."""
 
     initial_log_std: float = -0.5
     """Log standard deviation of the first policy, in units of half the action range."""
-    epochs: int = 6
+    epochs: Count = 6
     """Passes over the data of an iteration."""
-    minibatches: int = 8
+    minibatches: Count = 8
     """Gradient steps in a pass; divides num_envs * num_steps."""
-    accumulate: int = 1
+    accumulate: Count = 1
     """Parts of a minibatch whose gradients are computed one after the other, for less memory."""
-    trace: float = 0.95
+    trace: Share = 0.95
     """Lambda of the generalised advantage estimator."""
-    clip: float = 0.2
+    clip: Positive = 0.2
     """Largest change of the probability ratio that is rewarded."""
     value_clip: float | None = None
     """Largest change of a value in an iteration; none by default."""
     schedule: Literal["constant", "linear", "cosine"] = "linear"
     """How the learning rate goes, to 0 at the end unless constant."""
-    value_weight: float = 0.5
+    value_weight: NotNegative = 0.5
     """Weight of the value loss."""
-    entropy_weight: float = 0.0
+    entropy_weight: NotNegative = 0.0
     """Weight of the entropy bonus."""
 
-    def __post_init__(self):
-        super().__post_init__()
+    def check(self):
         if self.collected % self.minibatches:
             divisor = math.gcd(self.minibatches, self.collected)
             raise ValueError(
                 f"minibatches: {self.minibatches} does not divide num_envs * num_steps = "
                 f"{self.collected}; choose a divisor, for example {divisor}"
             )
-
-        if self.accumulate < 1 or self.minibatch % self.accumulate:
+        if self.minibatch % self.accumulate:
             raise ValueError(
                 f"accumulate: expected a divisor of num_envs * num_steps / minibatches = "
                 f"{self.minibatch}, found {self.accumulate}"

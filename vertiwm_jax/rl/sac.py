@@ -12,28 +12,22 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from vertiwm_jax.config import Positive, settings
 from vertiwm_jax.networks.policy import Senses, Squashed, SquashedActor
 from vertiwm_jax.rl.environments import Metrics
 from vertiwm_jax.rl.off_policy import Networks, OffPolicyConfig, Params, Remembered
 
 
-@dataclass(frozen=True)
+@settings
 class SACConfig(OffPolicyConfig):
     """Settings of SAC."""
 
     initial_log_std: float = -0.5
     """Log standard deviation of the first policy, in units of half the action range."""
-    initial_temperature: float = 0.1
+    initial_temperature: Positive = 0.1
     """Worth of a nat of entropy in the first policy, in units of (normalised) reward."""
     target_entropy: float = -2.0
     """Entropy, nats, of the actions in [-1, 1] that the temperature is adjusted to keep."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.initial_temperature <= 0:
-            raise ValueError(
-                f"initial_temperature: expected more than 0, found {self.initial_temperature}"
-            )
 
 
 @struct.dataclass

@@ -1,26 +1,27 @@
 """Settings that all algorithms have, with the defaults of PPO."""
 
 import math
-from dataclasses import dataclass
 
 import optax
 
+from vertiwm_jax.config import Count, Positive, Share, settings
 
-@dataclass(frozen=True)
+
+@settings
 class LearningConfig:
     """How much is experienced, and what networks learn from it."""
 
-    transitions: int = 1_500_000
+    transitions: Count = 1_500_000
     """Environment steps of the whole training, rounded up to whole iterations."""
-    num_envs: int = 256
+    num_envs: Count = 256
     """Environments run side by side."""
-    num_steps: int = 64
+    num_steps: Count = 64
     """Steps of each environment in an iteration."""
-    discount: float = 0.99
+    discount: Share = 0.99
     """Gamma."""
-    learning_rate: float = 1e-3
+    learning_rate: Positive = 1e-3
     """Of Adam, at the start."""
-    max_gradient_norm: float = 0.5
+    max_gradient_norm: Positive = 0.5
     """Gradients are clipped to this global norm."""
     hidden: tuple[int, ...] = (128, 128)
     """Widths of the layers of the actor and of each critic."""
@@ -28,11 +29,6 @@ class LearningConfig:
     """Whether observations are brought to zero mean and unit variance."""
     normalise_rewards: bool = True
     """Whether rewards are divided by the running deviation of the discounted return."""
-
-    def __post_init__(self):
-        for name in ("transitions", "num_envs", "num_steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
 
     @property
     def collected(self) -> int:

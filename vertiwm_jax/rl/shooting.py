@@ -1,6 +1,6 @@
 """Planning without a learned policy: gradient ascent on plans, through the model."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import cast
 
 import jax
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from vertiwm_jax.config import Count, CountOrZero, Positive, settings
 from vertiwm_jax.env.episode import NavigationParams, NavigationState
 from vertiwm_jax.env.observation import distance_and_bearing
 from vertiwm_jax.env.reward import ending_reward
@@ -19,36 +20,30 @@ from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.choice import Imagined
 
 
-@dataclass(frozen=True)
+@settings
 class ShootingConfig(OpenLoopConfig):
     """What `Shooting` imagines before it decides, and how it improves the best of it."""
 
-    candidates: int = 32
+    candidates: Count = 32
     """Plans compared at every decision; the first is what was intended anyway."""
-    improved: int = 4
+    improved: Count = 4
     """How many of them, the best, are improved."""
-    steps: int = 4
+    steps: CountOrZero = 4
     """Gradient steps by which each is improved."""
-    rate: float = 0.1
+    rate: Positive = 0.1
     """Size of these steps, by Adam, in units of half the action range."""
-    clearance: float = 0.3
+    clearance: Positive = 0.3
     """Metres in which nearing an obstacle, the edge or the goal goes over into having met it."""
-    leeway: float = 0.1
+    leeway: Positive = 0.1
     """Radians in which tilting goes over into rolling over."""
     model: Imagined = "bicycle"
     """What it imagines in; NeSAM's gradient takes minutes to compile, the bicycle's seconds."""
 
-    def __post_init__(self):
-        super().__post_init__()
-        if not 1 <= self.improved <= self.candidates:
+    def check(self):
+        if self.improved > self.candidates:
             raise ValueError(
                 f"improved: expected 1 to the {self.candidates} candidates, found {self.improved}"
             )
-        if self.steps < 0:
-            raise ValueError(f"steps: expected at least 0, found {self.steps}")
-        for name in ("rate", "clearance", "leeway"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name}: expected more than 0, found {getattr(self, name)}")
 
 
 @struct.dataclass

@@ -8,31 +8,24 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from vertiwm_jax.config import Count, NotNegative, settings
 from vertiwm_jax.networks.policy import Senses, Squashed, SquashedActor
 from vertiwm_jax.rl.environments import Metrics
 from vertiwm_jax.rl.off_policy import Networks, OffPolicyConfig, Params, Remembered
 
 
-@dataclass(frozen=True)
+@settings
 class TD3Config(OffPolicyConfig):
     """Settings of TD3."""
 
-    exploration: float = 0.3
+    exploration: NotNegative = 0.3
     """Standard deviation of the noise on actions while learning, in units of half their range."""
-    smoothing: float = 0.2
+    smoothing: NotNegative = 0.2
     """Standard deviation of the noise on the actions that targets are made of."""
-    largest_smoothing: float = 0.5
+    largest_smoothing: NotNegative = 0.5
     """Where that noise is cut off."""
-    policy_delay: int = 2
+    policy_delay: Count = 2
     """Gradient steps of the critics for each of the actor and of the targets."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        for name in ("exploration", "smoothing", "largest_smoothing"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name}: expected at least 0, found {getattr(self, name)}")
-        if self.policy_delay < 1:
-            raise ValueError(f"policy_delay: expected at least 1, found {self.policy_delay}")
 
 
 @struct.dataclass
