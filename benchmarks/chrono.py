@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks._harness import Figures, parser, report
 from benchmarks.models import rates
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.simulators import pilots
+from vertiwm_jax.simulators import excitation
 from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.worlds import Kind, WorldConfig
@@ -24,8 +24,8 @@ def driven(kind: Kind, drives: int, steps: int) -> dict[str, float | int]:
     starting, stepping = [], []
     for number in range(drives):
         rng, world = np.random.default_rng(number), terrain.select(number)
-        simulator, pilot = Chrono(world), pilots.sinusoids(rng, steps, lock)
-        start = pilots.start(rng, world, 0.1 * steps)
+        simulator, pilot = Chrono(world), excitation.sinusoids(rng, steps, lock)
+        start = excitation.start(rng, world, 0.1 * steps)
         began = time.perf_counter()
         state = simulator.start(*start).state
         ready = time.perf_counter()

@@ -39,9 +39,9 @@ from benchmarks.models import drives, driving
 from vertiwm_jax import config as configuration
 from vertiwm_jax import runs, training
 from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.suites import GroundConfig
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
-from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.rl.loop import Seeds
 from vertiwm_jax.world_model.choice import ModelName
 

@@ -12,13 +12,13 @@ from doors import refusal
 
 from vertiwm_jax import collect, evaluate, runs
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.observation import LAYOUT, OBSERVATION_SIZE
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.learning.dataset import Auxiliary
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.simulators import chrono, pilots, recording
+from vertiwm_jax.simulators import chrono, excitation, recording
 from vertiwm_jax.simulators.protocol import Observation, SimulatorError
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
@@ -189,7 +189,7 @@ def test_endings(maps, index, value, ending, length):
     states = np.zeros((6, 12))
     states[3:, index] = value
     level = files.load(maps / "map_0.npz")
-    pilot = pilots.sinusoids(np.random.default_rng(0), 5, 0.3725)
+    pilot = excitation.sinusoids(np.random.default_rng(0), 5, 0.3725)
     drive = recording.record(Scripted(states), level, (0, 0, 0), pilot, 5)
     assert (drive.ending, len(drive.control), len(drive.observations)) == (
         ending, length, length + 1,
@@ -206,7 +206,7 @@ def test_starts_are_level_roomy_and_near_borders(maps):
     semantic[:, 6:8] = SAND
     terrain = terrain_map.build(steep, semantic, obstacles=boxes)
     for seed in range(20):
-        x, y, yaw = pilots.start(np.random.default_rng(seed), terrain, 16.0)
+        x, y, yaw = excitation.start(np.random.default_rng(seed), terrain, 16.0)
         assert abs(x) <= 59 and abs(y) <= 59 and x < 38
         assert np.hypot(boxes[:, 0] - x, boxes[:, 1] - y).min() >= 8
         end = np.array([x, y]) + 39 * np.array([np.cos(yaw), np.sin(yaw)])
@@ -216,7 +216,7 @@ def test_starts_are_level_roomy_and_near_borders(maps):
     slope = np.broadcast_to(0.4 * np.arange(65.0), (65, 65))
     steep = terrain_map.build(slope, np.full((8, 8), GRASS), elevation_range=(0, 64))
     with pytest.raises(SimulatorError, match="20 degrees or less"):
-        pilots.start(np.random.default_rng(0), steep, 16.0)
+        excitation.start(np.random.default_rng(0), steep, 16.0)
 
 
 class AtGoal:
@@ -235,7 +235,7 @@ def test_a_policy_drives_from_goal_to_goal(maps, eyes):
     terrain, config = files.load(maps / "map_0.npz"), NavigationConfig(speed_range=(0.0, 5.0))
     size = OBSERVATION_SIZE + (math.prod(EMBEDDING_SHAPE) if eyes else 0)
     policy = jax.tree_util.Partial(AtGoal(size))
-    pilot = pilots.Learned(policy, config, eyes, terrain, np.random.default_rng(0))
+    pilot = excitation.Learned(policy, config, eyes, terrain, np.random.default_rng(0))
     state, goals = np.zeros(12, np.float32), []
     for _ in range(3):
         command = pilot(state)
@@ -269,9 +269,9 @@ def test_a_policy_sees_as_far_as_it_did_in_training():
     acted = {}
     for sight in (12.0, np.inf):
         config = NavigationConfig(reveal=RevealConfig(range=sight))
-        routes = pilots._route(config, terrain, goal[:2])
+        routes = excitation._route(config, terrain, goal[:2])
         known = config, policy, None, terrain, None, routes
-        belief, acted[sight], _ = pilots._act(*known, state, goal, standing)
+        belief, acted[sight], _ = excitation._act(*known, state, goal, standing)
         assert (belief is None) == np.isinf(sight)
     assert acted[np.inf][0] - acted[12.0][0] > 0.05
     # Of two who look at the same hills one knows that the way up costs more than its length.

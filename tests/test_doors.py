@@ -18,8 +18,8 @@ from vertiwm_jax import checkpoints, devices, evaluate, export, policy_training,
 from vertiwm_jax import config as configuration
 from vertiwm_jax.deploy import run_policy
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
 from vertiwm_jax.rl.planning import PlanningConfig

@@ -18,10 +18,10 @@ from vertiwm_jax import export, runs
 from vertiwm_jax.deploy import onnx_graph, run_policy, stablehlo
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env import observation, route
-from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.controllers import LookAhead, StraightToGoal
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZE
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.evaluation import navigation
-from vertiwm_jax.evaluation.controllers import LookAhead, StraightToGoal
 from vertiwm_jax.networks.policy import Actor, Senses, SquashedActor
 from vertiwm_jax.rl.learned import Corrected, MeanAction
 from vertiwm_jax.rl.normalise import RunningStatistics

@@ -16,15 +16,15 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import export, runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import Bounds, ConfigError, Count, settings
-from vertiwm_jax.env.driver import Policy
-from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env import suites
+from vertiwm_jax.env.agent import Policy
+from vertiwm_jax.env.suites import GroundConfig
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.evaluate import training
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig
-from vertiwm_jax.rl import ground
-from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.runs import Progress, RunError
-from vertiwm_jax.simulators import chrono, pilots, processes, recording
+from vertiwm_jax.simulators import chrono, excitation, processes, recording
 from vertiwm_jax.simulators.builtin import BuiltIn
 from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.simulators.protocol import SimulatorError
@@ -159,11 +159,11 @@ def record(task: Task) -> Drive:
     simulator = Chrono(terrain) if chrono_drives else BuiltIn(terrain, task.vehicle)
     for attempt in range(ATTEMPTS):
         rng = np.random.default_rng([command.seed, task.world, task.drive, attempt])
-        start = pilots.start(rng, terrain, command.seconds)
+        start = excitation.start(rng, terrain, command.seconds)
         if task.learned:
-            pilot = pilots.Learned(*task.learned, terrain, rng)
+            pilot = excitation.Learned(*task.learned, terrain, rng)
         else:
-            pilot = pilots.sinusoids(rng, command.steps, float(task.vehicle.steering_limit))
+            pilot = excitation.sinusoids(rng, command.steps, float(task.vehicle.steering_limit))
         tries.append(recording.record(simulator, terrain, start, pilot, command.steps))
         if len(tries[-1].control) >= SHORTEST * command.steps:
             break
@@ -179,7 +179,7 @@ def record(task: Task) -> Drive:
 def _terrain(command: Collect, scale: float) -> TerrainMap:
     """All worlds to drive on."""
     if command.worlds:
-        return ground.load(GroundConfig(obstacles=command.obstacles), command.worlds, scale)
+        return suites.load(GroundConfig(obstacles=command.obstacles), command.worlds, scale)
     config = WorldConfig(command.difficulties, command.kinds)
     count = command.repeats * len(command.difficulties) * len(command.kinds)
     return worlds.generate(jax.random.split(jax.random.key(command.seed), count), config, scale)

@@ -10,17 +10,18 @@ import tyro
 from vertiwm_jax import config as configuration
 from vertiwm_jax import policy_training, runs
 from vertiwm_jax.config import AtLeastOne, ConfigError, Count
-from vertiwm_jax.env.driver import Driver, Policy
+from vertiwm_jax.env import suites
+from vertiwm_jax.env.agent import Agent, Policy
+from vertiwm_jax.env.controllers import REFERENCE, baselines
+from vertiwm_jax.env.suites import SUITES, GroundConfig, Suite
 from vertiwm_jax.evaluate import ALGORITHMS
-from vertiwm_jax.evaluation import outside, policy_table, report
-from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
+from vertiwm_jax.evaluation import external, policy_table, report
+from vertiwm_jax.evaluation.external import Arena
 from vertiwm_jax.evaluation.navigation import NavigationResult
-from vertiwm_jax.evaluation.outside import Arena
 from vertiwm_jax.evaluation.policy_table import TrainingCost
 from vertiwm_jax.evaluation.report import Results
 from vertiwm_jax.policy_training import TrainConfig
-from vertiwm_jax.rl import ground, task
-from vertiwm_jax.rl.ground import SUITES, GroundConfig, Suite
+from vertiwm_jax.rl import task
 from vertiwm_jax.runs import Run
 from vertiwm_jax.simulators import processes
 from vertiwm_jax.simulators.processes import Map
@@ -29,7 +30,7 @@ from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.training import failures_in_one_line, keep_compiled
 from vertiwm_jax.world_model.choice import ModelName
 
-Policies = Callable[[TerrainMap], Mapping[str, Policy | Driver]]
+Policies = Callable[[TerrainMap], Mapping[str, Policy | Agent]]
 """Policies that drive on any worlds of one kind of map."""
 
 
@@ -97,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             names = " and ".join(sorted(vehicles))
             raise ConfigError(f"{config.settings}: vehicle: expected one for all, found {names}")
         for simulator in config.simulators:
-            outside.expect(simulator, settings[config.rows[0]])
+            external.expect(simulator, settings[config.rows[0]])
         with Run.begin(config, config.name) as run:
             print(f"run folder {run.folder}", flush=True)
             folders = {row: _train(row, settings[row], run.folder) for row in config.rows}
@@ -130,7 +131,7 @@ def _judge_all(
 ) -> None:
     key = task.TaskConfig(seed=config.seed).key("worlds")
     first = settings[config.rows[0]]
-    terrain = ground.suite_worlds(config.grounds, key, first.driven.scale)
+    terrain = suites.suite_worlds(config.grounds, key, first.driven.scale)
     rows = [(settings[row], _learned(row, settings[row], folders[row])) for row in config.rows]
     rows.append((first, lambda _: baselines(first.asked)))
     judged = {}
@@ -148,7 +149,7 @@ def _judge_all(
 def _learned(row: Row, settings: TrainConfig, folder: Path) -> Policies:
     """The policies of a training, by their names in the table."""
 
-    def restored(terrain: TerrainMap) -> dict[str, Policy | Driver]:
+    def restored(terrain: TerrainMap) -> dict[str, Policy | Agent]:
         found = policy_training.learned(settings, terrain, folder)
         return {name.replace(row.algorithm, str(row), 1): x for name, x in found.items()}
 
@@ -166,8 +167,8 @@ def _judge(
     groups: dict[str, dict[str, NavigationResult]] = {}
     for settings, policies in rows:
         settings = replace(settings, ground=grounds)
-        test = outside.test_in(simulator, settings, terrain)
-        judge = outside.judge_in(simulator, settings, terrain, mapped)
+        test = external.test_in(simulator, settings, terrain)
+        judge = external.judge_in(simulator, settings, terrain, mapped)
         key = settings.key("testing")
         driven = report.drive(test.env, test.params, policies(terrain), key, judge)
         for suite, results in driven.items():

@@ -15,18 +15,20 @@ from vertiwm_jax.adaptation.soil_filter import SoilFilter
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import AtLeastOne, ConfigError, Count, CountOrZero, settings
 from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.env import suites
+from vertiwm_jax.env.controllers import REFERENCE, baselines
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.suites import Suite
 from vertiwm_jax.evaluation import (
     adaptation,
     calibration,
-    outside,
+    external,
     plots,
     prediction,
     prediction_report,
     report,
 )
-from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
-from vertiwm_jax.evaluation.outside import Arena
+from vertiwm_jax.evaluation.external import Arena
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.fit import FitConfig
 from vertiwm_jax.learning import dataset
@@ -36,8 +38,7 @@ from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, hmmwv
 from vertiwm_jax.policy_training import TrainConfig
 from vertiwm_jax.ppo import PPOTraining
-from vertiwm_jax.rl import ground, task
-from vertiwm_jax.rl.ground import Suite
+from vertiwm_jax.rl import task
 from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
 from vertiwm_jax.rl.planning import PlanningConfig
 from vertiwm_jax.rl.shooting import Shooting, ShootingConfig
@@ -287,10 +288,10 @@ def _navigate(command: Navigation) -> None:
     try:
         trained = training(file)
         config = _adapted(trained, command)
-        outside.expect(command.simulator, config)
+        external.expect(command.simulator, config)
         maps, scale = command.worlds, config.driven.scale
-        terrain = ground.load(config.ground, maps, scale) if maps else task.held_out(config)
-        test = outside.test_in(command.simulator, config, terrain)
+        terrain = suites.load(config.ground, maps, scale) if maps else task.held_out(config)
+        test = external.test_in(command.simulator, config, terrain)
     except ValueError as error:  # what is wrong with configuration, maps, or tasks on them
         sys.exit(f"error: {error}")
     policies = baselines(config.asked)
@@ -310,7 +311,7 @@ def _navigate(command: Navigation) -> None:
     elif command.policy == "straight":
         policies = {REFERENCE: policies[REFERENCE]}
     with processes.simulating(command.jobs) as mapped:
-        judge = outside.judge_in(command.simulator, config, terrain, mapped)
+        judge = external.judge_in(command.simulator, config, terrain, mapped)
         groups = report.drive(test.env, test.params, policies, config.key("testing"), judge)
     print(f"\n{report.markdown(groups, REFERENCE)}")
     if command.output:

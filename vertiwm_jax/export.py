@@ -16,7 +16,7 @@ from vertiwm_jax import policy_training, runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.deploy import description, run_policy, stablehlo
-from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.evaluate import training
 from vertiwm_jax.policy_training import TrainConfig
 from vertiwm_jax.rl.learned import Corrected, MeanAction

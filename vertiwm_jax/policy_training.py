@@ -13,13 +13,14 @@ import jax
 from vertiwm_jax import config as configuration
 from vertiwm_jax import devices, runs
 from vertiwm_jax.checkpoints import CheckpointError
-from vertiwm_jax.env.driver import Driver, Policy
-from vertiwm_jax.env.episode import NavigationParams
+from vertiwm_jax.env import suites
+from vertiwm_jax.env.action_repeat import ActionRepeat, Controller
+from vertiwm_jax.env.agent import Agent, Policy
+from vertiwm_jax.env.controllers import REFERENCE, baselines
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.repeat import ActionRepeat, Controller
+from vertiwm_jax.env.task import TaskParams
 from vertiwm_jax.evaluation import plots, report
-from vertiwm_jax.evaluation.controllers import REFERENCE, baselines
-from vertiwm_jax.rl import ground, task
+from vertiwm_jax.rl import task
 from vertiwm_jax.rl.learned import Corrected, MeanAction, TwinValue, Value
 from vertiwm_jax.rl.loop import LoopConfig, prepare, restore, train
 from vertiwm_jax.rl.planning import Planner, PlanningConfig
@@ -29,17 +30,17 @@ from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.training import Algorithm, failures_in_one_line, keep_compiled
 
-Rows = dict[str, Policy | Driver]
+Rows = dict[str, Policy | Agent]
 
 
 class Learning(Algorithm[Any], Protocol):
     """An algorithm that learns a policy from environments."""
 
-    def policy(self, env_params: NavigationParams, state: Any, /) -> MeanAction:
+    def policy(self, env_params: TaskParams, state: Any, /) -> MeanAction:
         """What `state` has learned."""
         ...
 
-    def value(self, env_params: NavigationParams, state: Any, /) -> Value | TwinValue:
+    def value(self, env_params: TaskParams, state: Any, /) -> Value | TwinValue:
         """What `state` expects of its policy."""
         ...
 
@@ -108,7 +109,7 @@ def learned(config: TrainConfig, terrain: TerrainMap, run: Path) -> Rows:
     """
     dynamics, weights = task.dynamics(config, config.model)
     env = NavigationEnv(dynamics, config.asked, config.variation)
-    params = env.shapes(weights, terrain, ground.test_tasks(config.ground, terrain))
+    params = env.shapes(weights, terrain, suites.test_tasks(config.ground, terrain))
     algorithm = config.algorithm(env)
     restored = restore(algorithm, params, run, config.loop.seeds)
     if restored is None:
@@ -120,9 +121,7 @@ def _base(config: TrainConfig) -> Controller | None:
     return None if config.base == "none" else baselines(config.asked)[config.base]
 
 
-def _policies(
-    config: TrainConfig, algorithm: Learning, params: NavigationParams, state: Any
-) -> Rows:
+def _policies(config: TrainConfig, algorithm: Learning, params: TaskParams, state: Any) -> Rows:
     base, rows = _base(config), {}
     for seed in range(config.loop.seeds):
         of_seed = jax.tree.map(lambda x, seed=seed: x[seed], state)

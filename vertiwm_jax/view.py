@@ -12,11 +12,12 @@ import tyro
 from vertiwm_jax import policy_training
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError, CountOrZero, settings
+from vertiwm_jax.env import suites
+from vertiwm_jax.env.suites import Suite
 from vertiwm_jax.evaluate import training
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV
-from vertiwm_jax.rl import ground, task
-from vertiwm_jax.rl.ground import Suite
+from vertiwm_jax.rl import task
 from vertiwm_jax.runs import RunError
 from vertiwm_jax.viewing import driven, movie, recorded
 from vertiwm_jax.viewing.scene import Scene
@@ -128,7 +129,7 @@ def _driven(command: View) -> Scene:
         config = replace(config, vehicle=command.vehicle)
     terrain = task.held_out(config)
     policies = policy_training.learned(config, terrain, run)
-    pool = ground.test_tasks(config.ground, terrain)
+    pool = suites.test_tasks(config.ground, terrain)
     for name, found, count in (("task", number, len(pool.world)), ("seed", seed, len(policies))):
         if not 0 <= found < count:
             raise ConfigError(f"{run}: {name}: expected 0 to {count - 1}, found {found}")

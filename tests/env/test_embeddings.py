@@ -11,10 +11,10 @@ from env.worlds import BICYCLE, SNOW, Scripted, hills, task
 
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_LIMIT, OBSERVATION_SIZE
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
@@ -71,7 +71,7 @@ def test_what_is_seen_where_a_model_diverged_is_finite(terrain):
     script = VehicleState(jnp.full((1, 3), jnp.nan), *(jnp.zeros((1, 3)),) * 3)
     moves = sighted("builtin", Scripted(CONFIG.settle_steps), script)
     _, seen, state = stepped(CONFIG, *moves, terrain)
-    assert state.ending == Ending.DIVERGED and bool(jnp.all(jnp.isfinite(seen)))
+    assert state.ending == TerminationReason.DIVERGED and bool(jnp.all(jnp.isfinite(seen)))
 
 
 def test_a_model_without_eyes_is_refused(terrain):

@@ -6,10 +6,10 @@ from env.worlds import bicycle_env, ground, hills, task
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.gymnasium import NavigationGymEnv, NavigationVectorEnv
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.termination import TerminationReason
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def test_single_ends_by_truncation_and_shows_the_world(short):
     env.reset(seed=3)
     ends = [env.step(np.array([1.0, 0.0], np.float32))[2:] for _ in range(3)]
     assert [end[:2] for end in ends] == [(False, False), (False, False), (False, True)]
-    assert ends[-1][2]["ending"] == Ending.TIMED_OUT
+    assert ends[-1][2]["ending"] == TerminationReason.TIMED_OUT
     picture = env.render()
     assert picture.shape == (512, 512, 3) and picture.dtype == np.uint8
     red = (picture == np.round(255 * np.array([0.8, 0.05, 0.05]))).all(-1)
@@ -71,7 +71,7 @@ def test_vector_resets_in_the_step_that_ends(short):
     assert not terminated.any() and truncated.all() and reward.shape == (4,)
     assert observation in env.observation_space
     assert info["_final_obs"].all() and not info["_ending"].any()
-    assert (info["final_info"]["ending"] == Ending.TIMED_OUT).all()
+    assert (info["final_info"]["ending"] == TerminationReason.TIMED_OUT).all()
     starts = np.asarray(short[1].start_observation)
     for now, final in zip(observation, info["final_obs"], strict=True):
         assert (now == starts).all(-1).any() and not (final == starts).all(-1).any()

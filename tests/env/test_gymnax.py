@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from vertiwm_jax.checkpoints import CheckpointError
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.gymnax import NAME
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.terrain.worlds import WorldConfig
 
 STEPS = 6
@@ -49,7 +49,7 @@ def test_random_rollouts_in_gymnax_s_own_way(made):
     assert not terminated.any()
     # Episodes are over after three steps, and begin anew.
     np.testing.assert_array_equal(truncated, [[i % 3 == 2 for i in range(STEPS)]] * 4)
-    assert (info["ending"][:, 2] == Ending.TIMED_OUT).all()
+    assert (info["ending"][:, 2] == TerminationReason.TIMED_OUT).all()
     assert len(np.unique(info["distance"][:, 2])) > 1
 
 

@@ -11,12 +11,12 @@ from flax import struct
 
 from vertiwm_jax import devices
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.reward import RewardConfig
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.rl import task as task_of_learning
 from vertiwm_jax.rl.task import TaskConfig
@@ -59,7 +59,7 @@ def play(script, steps, terrain=OPEN, goal=(30.0, 0.0), model=Scripted, **settin
 
 
 def endings(outputs):
-    return [Ending(int(info["ending"])).name for *_, info in outputs]
+    return [TerminationReason(int(info["ending"])).name for *_, info in outputs]
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def test_step_compiles_once_and_resets_by_itself():
         _, states, _, terminated, truncated, info = out = step(jax.random.key(i), states, params)
         assert not terminated.any() and truncated.all() == (i == 5)
     # What the episode ended with, and the first of the next one.
-    assert (info["ending"] == Ending.TIMED_OUT).all() and (states.time == 0).all()
+    assert (info["ending"] == TerminationReason.TIMED_OUT).all() and (states.time == 0).all()
     final, first = np.asarray(info["final_observation"]), np.asarray(out[0])
     assert (final[:, 2] > 0.1).all() and (first[:, 2] == 0).all()
     assert set(map(bytes, first)) <= set(map(bytes, np.asarray(params.start_observation)))

@@ -8,8 +8,8 @@ from env.worlds import GRASS, SNOW, hills
 
 from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.route import RouteConfig
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import obstacles

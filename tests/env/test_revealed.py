@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from env.worlds import bicycle_env, ground, hills, step_of_many, task
 
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.observation import LAYOUT, arcs_ahead
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.terrain.reveal import RevealConfig
 
 KEY = jax.random.key(0)
@@ -93,9 +93,9 @@ def test_a_wall_is_seen_when_it_comes_into_range():
     crown = np.asarray(jax.vmap(arcs_ahead)(seen)[1]).max(axis=(1, 2))
     gap = -np.asarray(states.vehicle.position[:, 0])
     assert (crown[gap > 14.0] < 1e-3).all() and (crown[(gap < 10.5) & (gap > 6)] > 1).all()
-    assert Ending(int(states.ending[-1])) == Ending.COLLIDED
+    assert TerminationReason(int(states.ending[-1])) == TerminationReason.COLLIDED
     # An episode that is over stays as it is.
-    over = np.flatnonzero(np.asarray(states.ending) != Ending.RUNNING)
+    over = np.flatnonzero(np.asarray(states.ending) != TerminationReason.RUNNING)
     first, last = (jax.tree.map(lambda x, i=i: x[i], states.belief) for i in over[[0, -1]])
     chex.assert_trees_all_equal(first, last)
 

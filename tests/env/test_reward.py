@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import pytest
 
 from vertiwm_jax.env.reward import RewardConfig, reward
-from vertiwm_jax.env.termination import Ending, first_ending, is_terminal
+from vertiwm_jax.env.termination import TerminationReason as Reason
+from vertiwm_jax.env.termination import first_ending, is_terminal
 
 
 def value(**changes):
@@ -17,7 +18,7 @@ def value(**changes):
         "vertical_speed": 0.0,
         "disagreement": 0.0,
         "spread": 0.0,
-        "ending": Ending.RUNNING,
+        "ending": Reason.RUNNING,
     }
     terms.update(changes)
     arrays = {name: jnp.asarray(x) for name, x in terms.items()}
@@ -37,14 +38,14 @@ def value(**changes):
         ({"vertical_speed": -0.5}, -0.5),
         ({"disagreement": 0.02}, -2.0),
         ({"spread": 0.003}, -3.0),
-        ({"ending": Ending.GOAL}, 3000.0),
-        ({"ending": Ending.STUCK}, -300.0),
-        ({"ending": Ending.OFF_MAP}, -600.0),
-        ({"ending": Ending.ROLLED_OVER}, -600.0),
-        ({"ending": Ending.COLLIDED}, -600.0),
-        ({"ending": Ending.DIVERGED}, -600.0),
-        ({"ending": Ending.TIMED_OUT}, -400.0),
-        ({"progress": 0.2, "stalled": True, "ending": Ending.TIMED_OUT}, -400.0),
+        ({"ending": Reason.GOAL}, 3000.0),
+        ({"ending": Reason.STUCK}, -300.0),
+        ({"ending": Reason.OFF_MAP}, -600.0),
+        ({"ending": Reason.ROLLED_OVER}, -600.0),
+        ({"ending": Reason.COLLIDED}, -600.0),
+        ({"ending": Reason.DIVERGED}, -600.0),
+        ({"ending": Reason.TIMED_OUT}, -400.0),
+        ({"progress": 0.2, "stalled": True, "ending": Reason.TIMED_OUT}, -400.0),
     ],
 )
 def test_terms_are_those_computed_by_hand(changes, expected):
@@ -53,11 +54,15 @@ def test_terms_are_those_computed_by_hand(changes, expected):
 
 def test_the_gravest_ending_counts_and_only_time_out_is_not_terminal():
     yes, no = jnp.array(True), jnp.array(False)
-    conditions = dict.fromkeys(Ending, no)
-    del conditions[Ending.RUNNING]
-    assert int(first_ending(conditions)) == Ending.RUNNING
-    both = conditions | {Ending.GOAL: yes, Ending.ROLLED_OVER: yes, Ending.TIMED_OUT: yes}
-    assert int(first_ending(both)) == Ending.ROLLED_OVER
-    late = conditions | {Ending.GOAL: yes, Ending.TIMED_OUT: yes}
-    assert int(first_ending(late)) == Ending.GOAL
-    assert [bool(is_terminal(jnp.int32(e))) for e in Ending] == [False, False] + [True] * 6
+    conditions = dict.fromkeys(Reason, no)
+    del conditions[Reason.RUNNING]
+    assert int(first_ending(conditions)) == Reason.RUNNING
+    both = conditions | {
+        Reason.GOAL: yes,
+        Reason.ROLLED_OVER: yes,
+        Reason.TIMED_OUT: yes,
+    }
+    assert int(first_ending(both)) == Reason.ROLLED_OVER
+    late = conditions | {Reason.GOAL: yes, Reason.TIMED_OUT: yes}
+    assert int(first_ending(late)) == Reason.GOAL
+    assert [bool(is_terminal(jnp.int32(e))) for e in Reason] == [False, False] + [True] * 6

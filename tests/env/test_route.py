@@ -9,8 +9,8 @@ from scipy.sparse import csgraph
 
 from vertiwm_jax.env import route
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.footprint import Difficulty, footprint, places
 from vertiwm_jax.env.route import RouteConfig
+from vertiwm_jax.env.traversability import TraversabilityCost, footprint, places
 from vertiwm_jax.terrain import map as terrain_map
 
 CHASSIS = Chassis()
@@ -110,7 +110,7 @@ def test_costs_are_those_of_the_cheapest_way():
                     at = np.array(places(CHASSIS, begin + share * move, jnp.float32(heading)))
                     below = footprint(CHASSIS, jnp.asarray(bilinear(at)))
                     parts = below.crown, below.rise, below.bank, below.twist
-                    hard.append(float(Difficulty()(*parts)))
+                    hard.append(float(TraversabilityCost()(*parts)))
                 off = np.abs(begin + move / 2).max() > 64 - CHASSIS.length / 2
                 each = 1 + 3.0 * np.mean(hard) + 10.0 * off
                 weights[row * cells + column, to_row * cells + to_column] = np.hypot(*move) * each

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from env.worlds import bicycle_env, ground, hills
 
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.gymnasium import NavigationGymEnv
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
 
 

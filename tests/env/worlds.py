@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.env.episode import NavigationConfig, NavigationParams
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.task import NavigationConfig, TaskParams
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.mechanics.kinematic import BicycleParams, KinematicBicycle
 from vertiwm_jax.state import Command, VehicleState
@@ -53,13 +53,13 @@ def task(start: Any, goal: Any, yaw: float = 0.0) -> Tasks:
 
 def bicycle_env(
     terrain: TerrainMap, tasks: Tasks, config: NavigationConfig | None = None
-) -> tuple[NavigationEnv, NavigationParams]:
+) -> tuple[NavigationEnv, TaskParams]:
     """A kinematic bicycle over `terrain`."""
     env = NavigationEnv(KinematicBicycle(), config or NavigationConfig())
     return env, env.make_params(BICYCLE, terrain, tasks)
 
 
-def blocked(config: NavigationConfig) -> tuple[NavigationEnv, NavigationParams]:
+def blocked(config: NavigationConfig) -> tuple[NavigationEnv, TaskParams]:
     """A goal straight ahead, behind a wall 3 m wide; and the same the other way."""
     terrain = ground(obstacles=[[0.0, 0.0, 2.0, 3.0, 2.0]])
     there, back = task((-20.0, 0.0), (20.0, 0.0)), task((20.0, 0.0), (-20.0, 0.0), jnp.pi)

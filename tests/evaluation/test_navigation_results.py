@@ -10,12 +10,12 @@ from flax import struct
 from scipy.stats import binomtest
 
 from vertiwm_jax import devices
-from vertiwm_jax.env.driver import Driver
-from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.agent import Agent
+from vertiwm_jax.env.controllers import RandomActions, StraightToGoal
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation import navigation
-from vertiwm_jax.evaluation.controllers import RandomActions, StraightToGoal
 from vertiwm_jax.terrain import map as terrain_map
 
 CONFIG = NavigationConfig(horizon_seconds=12.0)
@@ -40,7 +40,7 @@ def test_agrees_with_a_loop_over_episodes(short, straight):
     for task in range(params.pool_size):
         observation, state = env.start(params, task)
         positions, tilts = [state.vehicle.position], []
-        while state.ending == Ending.RUNNING:
+        while state.ending == TerminationReason.RUNNING:
             action = policy(observation, jax.random.key(0))
             observation, state, *_ = step(jax.random.key(0), state, action, params)
             positions.append(state.vehicle.position)
@@ -60,7 +60,7 @@ def test_agrees_with_a_loop_over_episodes(short, straight):
 
 
 @struct.dataclass
-class Wandering(Driver):
+class Wandering(Agent):
     """Goes to the goal, but to a side, which it decides at random and by where it is."""
 
     interval = 7
@@ -97,7 +97,7 @@ def test_decides_for_each_that_drives_as_if_it_were_alone(short, together, monke
     for task in range(params.pool_size):
         observation, state = env.start(params, task)
         memory, time = wandering.start(params, state), 0
-        while state.ending == Ending.RUNNING:
+        while state.ending == TerminationReason.RUNNING:
             if time % interval == 0:
                 deciding = jax.random.fold_in(jax.random.fold_in(key, length), time)
                 own = jax.random.split(deciding, params.pool_size)[task]
@@ -114,9 +114,9 @@ def test_summary_counts(straight):
     summary = navigation.Summary.of(straight)
     ending = np.asarray(straight.ending)
     assert set(summary.endings) == {"goal", "collided"}
-    assert summary.successes == (ending == Ending.GOAL).sum() and summary.tasks == 6
+    assert summary.successes == (ending == TerminationReason.GOAL).sum() and summary.tasks == 6
     assert sum(summary.endings.values()) == 6
-    seconds = 0.1 * np.asarray(straight.steps)[ending == Ending.GOAL]
+    seconds = 0.1 * np.asarray(straight.steps)[ending == TerminationReason.GOAL]
     assert summary.seconds == pytest.approx(seconds.mean(), rel=1e-5)
     assert summary.seconds_deviation == pytest.approx(seconds.std(), rel=1e-3, abs=1e-5)
     every_step = np.concatenate([straight.path(i)[1][1:] for i in range(6)])
@@ -129,7 +129,7 @@ def test_time_runs_out_and_nobody_succeeds(short):
     env, params = short
     params = params.replace(max_steps_in_episode=jnp.int32(7))
     result = navigation.evaluate(env, params, StraightToGoal(CONFIG), jax.random.key(0))
-    assert (result.ending == Ending.TIMED_OUT).all() and (result.steps == 7).all()
+    assert (result.ending == TerminationReason.TIMED_OUT).all() and (result.steps == 7).all()
     row = navigation.Summary.of(result)
     assert row.successes == 0 and np.isnan(row.seconds)
     assert "0/6" in navigation.format_table({"slow": row})

@@ -3,7 +3,7 @@ import json
 import jax.numpy as jnp
 import pytest
 
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.termination import TerminationReason as Reason
 from vertiwm_jax.evaluation import policy_table
 from vertiwm_jax.evaluation.navigation import NavigationResult
 from vertiwm_jax.evaluation.policy_table import TrainingCost
@@ -12,7 +12,7 @@ from vertiwm_jax.evaluation.policy_table import TrainingCost
 def result(reached: int) -> NavigationResult:
     """Four episodes of 10 s, of which some reach the goal."""
     zeros, points = jnp.zeros(4), jnp.zeros((4, 2, 3))
-    ending = jnp.where(jnp.arange(4) < reached, int(Ending.GOAL), int(Ending.STUCK))
+    ending = jnp.where(jnp.arange(4) < reached, int(Reason.GOAL), int(Reason.STUCK))
     return NavigationResult(
         ending=ending,
         steps=jnp.full(4, 100),

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.termination import TerminationReason as Reason
 from vertiwm_jax.evaluation import report
 from vertiwm_jax.evaluation.navigation import NavigationResult
 from vertiwm_jax.terrain import map as terrain_map
@@ -17,7 +17,7 @@ WORLD = [0, 0, 1, 1, 2, 2]
 
 def result(reached: list[int]) -> NavigationResult:
     """Two episodes on each of three worlds, of 10, 20, ... steps; `reached` are 0 or 1."""
-    ending = jnp.where(jnp.asarray(reached) == 1, int(Ending.GOAL), int(Ending.STUCK))
+    ending = jnp.where(jnp.asarray(reached) == 1, int(Reason.GOAL), int(Reason.STUCK))
     steps = 10 * (1 + jnp.arange(6))
     zeros, points = jnp.zeros(6), jnp.zeros((6, 61, 3))
     return NavigationResult(

@@ -71,7 +71,7 @@ def test_an_unwritable_output_is_refused_first(tmp_path, monkeypatch, command):
     (tmp_path / "file").touch()
     recordings.write(tmp_path, **recordings.drives())
     for place, name in (
-        (evaluate.outside, "test_in"),
+        (evaluate.external, "test_in"),
         (evaluate.prediction, "evaluate"),
         (evaluate.calibration, "signs"),
     ):

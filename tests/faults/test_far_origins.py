@@ -7,10 +7,10 @@ from env.worlds import GRASS, bicycle_env, hills
 from faults.border import fault
 from importers.bags import Bag
 
-from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.controllers import StraightToGoal
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.evaluation import navigation
-from vertiwm_jax.evaluation.controllers import StraightToGoal
 from vertiwm_jax.importers import grid_map
 from vertiwm_jax.importers.settings import Frames, GridMapSettings
 from vertiwm_jax.terrain import files

@@ -10,9 +10,9 @@ import pytest
 from faults.border import fault
 
 from vertiwm_jax.deploy import description, onnx_graph, run_policy, stablehlo
-from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.controllers import LookAhead
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_SIZE
-from vertiwm_jax.evaluation.controllers import LookAhead
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.networks.policy import Actor, Senses
 from vertiwm_jax.rl.learned import Corrected, MeanAction
 from vertiwm_jax.rl.normalise import RunningStatistics

@@ -24,9 +24,9 @@ from rl.probes import ProbeParams, Target
 from vertiwm_jax import config as configuration
 from vertiwm_jax import ppo, runs
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.fit import FitConfig
 from vertiwm_jax.learning import pipeline, stages

@@ -8,11 +8,11 @@ from env import worlds
 from env.worlds import BICYCLE, ground, task
 
 from vertiwm_jax.env import route
-from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.controllers import StraightToGoal
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation import navigation
-from vertiwm_jax.evaluation.controllers import StraightToGoal
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
 from vertiwm_jax.terrain.reveal import RevealConfig
@@ -56,9 +56,9 @@ def decided(env, params, driver, start=0, corrections=None):
 def test_it_drives_around_what_driving_straight_runs_into(blocked):
     env, params = blocked
     straight = navigation.evaluate(env, params, StraightToGoal(CONFIG), KEY)
-    assert (straight.ending == Ending.COLLIDED).all()
+    assert (straight.ending == TerminationReason.COLLIDED).all()
     found = navigation.evaluate(env, params, driver(env), KEY)
-    assert (found.ending == Ending.GOAL).all()
+    assert (found.ending == TerminationReason.GOAL).all()
 
 
 def test_it_plans_in_what_it_has_seen_of_the_map():
@@ -74,7 +74,7 @@ def test_it_plans_in_what_it_has_seen_of_the_map():
     assert not np.allclose(*intended[CONFIG])
     env, params = worlds.blocked(seeing)
     found = navigation.evaluate(env, params, driver(env), KEY)
-    assert (found.ending == Ending.GOAL).all()
+    assert (found.ending == TerminationReason.GOAL).all()
 
 
 def test_the_model_follows_the_vehicle():
@@ -82,7 +82,7 @@ def test_the_model_follows_the_vehicle():
     env = NavigationEnv(Pulling(), replace(CONFIG, settle_steps=0))
     params = env.make_params(BICYCLE, ground(), task((-20.0, 0.0), (20.0, 0.0)))
     pulled = driver(env)
-    assert navigation.evaluate(env, params, pulled, KEY).ending[0] == Ending.GOAL
+    assert navigation.evaluate(env, params, pulled, KEY).ending[0] == TerminationReason.GOAL
     observation, state = env.start(params, jnp.int32(0))
     memory = pulled.start(params, state)
     act, step = jax.jit(pulled.act), jax.jit(env.step_env)

@@ -7,12 +7,12 @@ import pytest
 from env.worlds import BICYCLE, bicycle_env, ground, task
 from flax import struct
 
-from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.action_repeat import ActionRepeat
+from vertiwm_jax.env.controllers import StraightToGoal
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.repeat import ActionRepeat
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation import navigation
-from vertiwm_jax.evaluation.controllers import StraightToGoal
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.rl.learned import Corrected
@@ -70,8 +70,8 @@ def test_it_drives_around_what_its_policy_runs_into(blocked):
         ahead = planner(env, (0.3, 0.0), base=False, spread=0.6, **config)
         return navigation.evaluate(env, params, ahead, KEY).ending[0]
 
-    assert ending(candidates=1) == Ending.COLLIDED
-    assert ending(candidates=16, decisions=4) == Ending.GOAL
+    assert ending(candidates=1) == TerminationReason.COLLIDED
+    assert ending(candidates=16, decisions=4) == TerminationReason.GOAL
 
 
 def test_a_future_is_worth_its_rewards_and_what_is_expected_at_its_end(blocked):
@@ -91,12 +91,12 @@ def test_a_future_is_worth_its_rewards_and_what_is_expected_at_its_end(blocked):
     assert float(found) == pytest.approx(total + 0.9**3 * 7.0, rel=1e-4)
 
 
-@pytest.mark.parametrize("ending", [Ending.COLLIDED, Ending.TIMED_OUT])
+@pytest.mark.parametrize("ending", [TerminationReason.COLLIDED, TerminationReason.TIMED_OUT])
 def test_nothing_is_expected_after_the_end(blocked, ending):
     env, params = blocked
     observation, state = env.start(params, jnp.int32(0))
     near = {"position": state.vehicle.position.at[0].set(-5.0)}
-    if ending == Ending.TIMED_OUT:
+    if ending == TerminationReason.TIMED_OUT:
         params = params.replace(max_steps_in_episode=jnp.int32(3))
     else:
         state = replace(state, vehicle=replace(state.vehicle, **near))

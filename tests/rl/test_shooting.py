@@ -7,9 +7,9 @@ import pytest
 from env import worlds
 from env.worlds import BICYCLE, bicycle_env, ground, hills, task
 
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.rl.shooting import Shooting, ShootingConfig
@@ -58,7 +58,7 @@ def drawn(number, decisions=4, key=KEY):
 def test_it_drives_around_what_driving_straight_runs_into(blocked):
     env, params = blocked
     found = navigation.evaluate(env, params, driver(env), KEY)
-    assert (found.ending == Ending.GOAL).all()
+    assert (found.ending == TerminationReason.GOAL).all()
 
 
 def test_the_gradient_is_that_of_finite_differences(hilly):

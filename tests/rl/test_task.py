@@ -8,10 +8,10 @@ import pytest
 from vertiwm_jax import config, devices
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.suites import GroundConfig
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.rl import task
-from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.rl.task import TaskConfig
 from vertiwm_jax.terrain.classes import STANDARD
 

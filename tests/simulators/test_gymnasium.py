@@ -10,11 +10,11 @@ import pytest
 from env.worlds import SNOW, ground, hills, task
 from gymnasium.utils.env_checker import check_env
 
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.gymnasium import NavigationGymEnv
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import Tasks
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.termination import TerminationReason as Reason
 from vertiwm_jax.learning.dataset import Auxiliary
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
@@ -94,12 +94,12 @@ def change(x=0.0, z=0.0, roll=0.0):
 @pytest.mark.parametrize(
     ("number", "action", "ending"),
     [
-        (0, AHEAD, Ending.GOAL),
-        (1, AHEAD, Ending.COLLIDED),
-        (2, AHEAD, Ending.TIMED_OUT),
-        (3, AHEAD, Ending.OFF_MAP),
-        (4, STANDING, Ending.STUCK),
-        (5, None, Ending.TIMED_OUT),
+        (0, AHEAD, Reason.GOAL),
+        (1, AHEAD, Reason.COLLIDED),
+        (2, AHEAD, Reason.TIMED_OUT),
+        (3, AHEAD, Reason.OFF_MAP),
+        (4, STANDING, Reason.STUCK),
+        (5, None, Reason.TIMED_OUT),
     ],
 )
 def test_episodes_outside_jit_are_those_inside(both, number, action, ending):
@@ -117,7 +117,7 @@ def test_episodes_outside_jit_are_those_inside(both, number, action, ending):
         np.testing.assert_allclose([*our_info.values()], [*info.values()], atol=2e-3)
         if any(over):
             break
-    late = ending == Ending.TIMED_OUT
+    late = ending == Reason.TIMED_OUT
     assert our_info["ending"] == ending and over == [not late, late]
 
 
@@ -158,22 +158,22 @@ def test_the_simulator_is_told_metres_a_second_and_radians():
 @pytest.mark.parametrize(
     ("end", "ending"),
     [
-        (change(roll=1.1), Ending.ROLLED_OVER),
-        (change(z=np.nan), Ending.DIVERGED),
-        (change(x=45), Ending.GOAL),
+        (change(roll=1.1), Reason.ROLLED_OVER),
+        (change(z=np.nan), Reason.DIVERGED),
+        (change(x=45), Reason.GOAL),
     ],
 )
 def test_what_the_simulator_does_ends_the_episode(end, ending):
     env, ghosts = haunted(change(x=1), end)
     env.reset(seed=0)
     _, _, *over, info = env.step(np.zeros(2, np.float32))
-    assert over == [False, False] and info["ending"] == Ending.RUNNING
+    assert over == [False, False] and info["ending"] == Reason.RUNNING
     np.testing.assert_allclose(info["distance"], np.hypot(49, 0.5), rtol=1e-5)
     observation, _, *over, info = env.step(np.zeros(2, np.float32))
     assert over == [True, False] and info["ending"] == ending
     assert observation in env.observation_space
     env.reset()
-    assert len(ghosts) == 2 and env.step(np.zeros(2, np.float32))[4]["ending"] == Ending.RUNNING
+    assert len(ghosts) == 2 and env.step(np.zeros(2, np.float32))[4]["ending"] == Reason.RUNNING
 
 
 def test_a_step_needs_a_reset():

@@ -2,9 +2,9 @@ import jax
 import numpy as np
 from env.worlds import bicycle_env, ground, hills, task
 
-from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.controllers import StraightToGoal
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.evaluation import navigation
-from vertiwm_jax.evaluation.controllers import StraightToGoal
 from vertiwm_jax.viewing import driven
 
 

@@ -10,10 +10,10 @@ import numpy as np
 
 import vertiwm_jax
 from vertiwm_jax.env import observation
-from vertiwm_jax.env.episode import NavigationConfig
-from vertiwm_jax.env.footprint import Difficulty
+from vertiwm_jax.env.controllers import REFERENCE, LookAhead, StraightToGoal
 from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, LAYOUT, Part
-from vertiwm_jax.evaluation.controllers import REFERENCE, LookAhead, StraightToGoal
+from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.env.traversability import TraversabilityCost
 from vertiwm_jax.networks.policy import SquashedActor
 from vertiwm_jax.rl import normalise
 from vertiwm_jax.rl.learned import Corrected, MeanAction
@@ -88,6 +88,6 @@ def _numbers(base: Any) -> dict[str, Any]:
     own = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
     del own["config"]
     return {
-        name: dataclasses.asdict(value) if isinstance(value, Difficulty) else value
+        name: dataclasses.asdict(value) if isinstance(value, TraversabilityCost) else value
         for name, value in own.items()
     }

@@ -10,8 +10,8 @@ from jax import export
 
 from vertiwm_jax.env import observation
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.route import Routes
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.classes import STANDARD
 from vertiwm_jax.terrain.map import ELEVATION_RANGE, TerrainMap

@@ -9,9 +9,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from vertiwm_jax.env import picture
-from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env import render
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.state import STEP_SECONDS
 
 FRAMES_PER_SECOND = round(1 / STEP_SECONDS)
@@ -27,9 +27,7 @@ def _spaces(env: NavigationEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.
 
 # Equal environments share what these compile.
 @partial(jax.jit, static_argnames="env")
-def _reset(
-    env: NavigationEnv, key: jax.Array, params: NavigationParams
-) -> tuple[jax.Array, NavigationState]:
+def _reset(env: NavigationEnv, key: jax.Array, params: TaskParams) -> tuple[jax.Array, TaskState]:
     return env.reset_env(key, params)
 
 
@@ -37,9 +35,9 @@ def _reset(
 def _step(
     env: NavigationEnv,
     key: jax.Array,
-    state: NavigationState,
+    state: TaskState,
     action: jax.Array,
-    params: NavigationParams,
+    params: TaskParams,
 ) -> tuple[Any, ...]:
     result = env.step_env(jax.random.fold_in(key, state.time), state, action, params)
     return *result, env.is_truncated(result[1], params)
@@ -47,8 +45,8 @@ def _step(
 
 @partial(jax.jit, static_argnames=("env", "count"))
 def _reset_all(
-    env: NavigationEnv, key: jax.Array, params: NavigationParams, count: int
-) -> tuple[jax.Array, NavigationState]:
+    env: NavigationEnv, key: jax.Array, params: TaskParams, count: int
+) -> tuple[jax.Array, TaskState]:
     return jax.vmap(env.reset, (0, None))(jax.random.split(key, count), params)
 
 
@@ -56,9 +54,9 @@ def _reset_all(
 def _step_all(
     env: NavigationEnv,
     key: jax.Array,
-    states: NavigationState,
+    states: TaskState,
     actions: jax.Array,
-    params: NavigationParams,
+    params: TaskParams,
 ) -> tuple[Any, ...]:
     keys = jax.random.split(key, len(actions))
     return jax.vmap(env.step, (0, 0, 0, None))(keys, states, actions, params)
@@ -73,14 +71,14 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012
 
     def __init__(
-        self, env: NavigationEnv, params: NavigationParams, render_mode: str | None = None
+        self, env: NavigationEnv, params: TaskParams, render_mode: str | None = None
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f'render_mode: expected None or "rgb_array", found {render_mode!r}')
         self.observation_space, self.action_space = _spaces(env)
         self.render_mode = render_mode
         self._env, self._params = env, params
-        self._state: NavigationState | None = None
+        self._state: TaskState | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -107,7 +105,7 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             return None
         state = jax.tree.map(np.asarray, self._state)
         vehicle, config = state.vehicle, self._env.config
-        return picture.from_above(
+        return render.from_above(
             self._params.terrain,
             int(state.world),
             vehicle.position,
@@ -117,7 +115,7 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             config.chassis,
         )
 
-    def _start(self) -> tuple[jax.Array, NavigationState]:
+    def _start(self) -> tuple[jax.Array, TaskState]:
         return _reset(self._env, self._key, self._params)
 
 
@@ -129,13 +127,13 @@ class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
-    def __init__(self, env: NavigationEnv, params: NavigationParams, num_envs: int) -> None:
+    def __init__(self, env: NavigationEnv, params: TaskParams, num_envs: int) -> None:
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = _spaces(env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._env, self._params = env, params
-        self._state: NavigationState | None = None
+        self._state: TaskState | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

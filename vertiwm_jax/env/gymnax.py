@@ -12,8 +12,8 @@ from typing import Self
 import gymnax
 import jax
 
-from vertiwm_jax.env.episode import NavigationConfig, NavigationParams
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.task import NavigationConfig, TaskParams
 from vertiwm_jax.env.tasks import random_tasks
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.worlds import WorldConfig
@@ -49,7 +49,7 @@ class ProceduralNavigation(NavigationEnv):
         return cls(seen, config, model=model, **settings)
 
     @property
-    def default_params(self) -> NavigationParams:
+    def default_params(self) -> TaskParams:
         """Drawn and settled anew whenever asked for, in seconds: keep them, and pass them on."""
         world_key, task_key = jax.random.split(jax.random.key(self.seed))
         terrain = worlds.generate(jax.random.split(world_key, self.number), self.relief)

@@ -12,12 +12,12 @@ from gymnax.environments import environment, spaces
 
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE, Dynamics, Params, disagreement, spread, step
 from vertiwm_jax.env import observation
-from vertiwm_jax.env.episode import NavigationConfig, NavigationParams, NavigationState, see
+from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
+from vertiwm_jax.env.resets import ResetPool
 from vertiwm_jax.env.reward import reward
-from vertiwm_jax.env.starts import Starts
+from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState, see
 from vertiwm_jax.env.tasks import Tasks
-from vertiwm_jax.env.termination import Ending, edge_distance, first_ending, is_terminal
-from vertiwm_jax.env.variation import Variation, VariationConfig
+from vertiwm_jax.env.termination import TerminationReason, edge_distance, first_ending, is_terminal
 from vertiwm_jax.networks.policy import Senses
 from vertiwm_jax.state import STEP_SECONDS, VehicleState
 from vertiwm_jax.terrain import obstacles, patches, query, reveal
@@ -25,7 +25,7 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 
 @dataclasses.dataclass(frozen=True)
-class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
+class NavigationEnv(environment.Environment[TaskState, TaskParams]):
     """Drives to a goal with actions in [-1, 1]^2, speed and steering, at 10 Hz.
 
     Two environments of equal `dynamics`, `config` and `variation` are equal and share compiled
@@ -34,7 +34,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
 
     dynamics: Dynamics
     config: NavigationConfig = dataclasses.field(default_factory=NavigationConfig)
-    variation: VariationConfig = VariationConfig()
+    variation: RandomizationConfig = RandomizationConfig()
 
     def __post_init__(self) -> None:
         chassis = self.config.chassis
@@ -42,7 +42,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         top_speed = max(abs(speed) for speed in self.config.speed_range)
         patches.footprint_covered(reach, top_speed)
 
-    def make_params(self, dynamics: Params, terrain: TerrainMap, tasks: Tasks) -> NavigationParams:
+    def make_params(self, dynamics: Params, terrain: TerrainMap, tasks: Tasks) -> TaskParams:
         """Parameters whose pool of starts is `tasks`, each settled on the ground by the model.
 
         `ValueError` names the first task that cannot be driven, or whose settled state is not
@@ -50,7 +50,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         """
         return self._starts.settled(dynamics, terrain, tasks)
 
-    def shapes(self, dynamics: Params, terrain: TerrainMap, tasks: Tasks) -> NavigationParams:
+    def shapes(self, dynamics: Params, terrain: TerrainMap, tasks: Tasks) -> TaskParams:
         """What `make_params` gives, but for the starts, of which only shapes are known.
 
         Enough to restore what was learned with such parameters, or to compile what will be, without
@@ -58,27 +58,25 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         """
         return self._starts.shapes(dynamics, terrain, tasks)
 
-    def start(
-        self, params: NavigationParams, index: jax.Array
-    ) -> tuple[jax.Array, NavigationState]:
+    def start(self, params: TaskParams, index: jax.Array) -> tuple[jax.Array, TaskState]:
         """Observation and state of start `[]` of the pool."""
         return jax.tree.map(lambda x: x[index], (params.start_observation, params.starts))
 
-    def reset_env(
-        self, key: jax.Array, params: NavigationParams
-    ) -> tuple[jax.Array, NavigationState]:
+    def reset_env(self, key: jax.Array, params: TaskParams) -> tuple[jax.Array, TaskState]:
         """A start drawn evenly from the pool, and how the episode varies."""
         seen, state = self.start(params, jax.random.randint(key, (), 0, params.pool_size))
-        variation = Variation.draw(self.variation, jax.random.fold_in(key, 1), state.action)
+        variation = DomainRandomization.draw(
+            self.variation, jax.random.fold_in(key, 1), state.action
+        )
         return seen, dataclasses.replace(state, variation=variation)
 
     def step_env(
         self,
         key: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         action: int | float | jax.Array,
-        params: NavigationParams,
-    ) -> tuple[jax.Array, NavigationState, jax.Array, jax.Array, dict[Any, Any]]:
+        params: TaskParams,
+    ) -> tuple[jax.Array, TaskState, jax.Array, jax.Array, dict[Any, Any]]:
         """One step of 0.1 s; a state that diverged is replaced by the last plausible one.
 
         An episode that is over stays as it is, and gives no reward. Only its history goes on, and
@@ -92,7 +90,7 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         moved, history = step(
             self.dynamics, params.dynamics, ground, state.history, state.vehicle, command
         )
-        running = state.ending == Ending.RUNNING
+        running = state.ending == TerminationReason.RUNNING
         apart = disagreement(history)
         plausible = self._is_plausible(terrain, moved, apart)
         vehicle, action = jax.tree.map(
@@ -111,16 +109,16 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         chassis = config.chassis
         ending = first_ending(
             {
-                Ending.TIMED_OUT: time >= params.max_steps_in_episode,
-                Ending.GOAL: distance < config.goal_radius,
-                Ending.STUCK: stalled * STEP_SECONDS >= config.stuck_seconds,
-                Ending.COLLIDED: obstacles.collides(
+                TerminationReason.TIMED_OUT: time >= params.max_steps_in_episode,
+                TerminationReason.GOAL: distance < config.goal_radius,
+                TerminationReason.STUCK: stalled * STEP_SECONDS >= config.stuck_seconds,
+                TerminationReason.COLLIDED: obstacles.collides(
                     terrain, xy, yaw, chassis.length, chassis.width
                 ),
-                Ending.OFF_MAP: edge_distance(terrain, xy) < config.map_margin,
-                Ending.ROLLED_OVER: jnp.maximum(jnp.abs(roll), jnp.abs(pitch))
+                TerminationReason.OFF_MAP: edge_distance(terrain, xy) < config.map_margin,
+                TerminationReason.ROLLED_OVER: jnp.maximum(jnp.abs(roll), jnp.abs(pitch))
                 > config.rollover_angle,
-                Ending.DIVERGED: ~plausible,
+                TerminationReason.DIVERGED: ~plausible,
             }
         )
         ending = jnp.where(running, ending, state.ending)
@@ -165,33 +163,33 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
     def observe(
         self,
         key: jax.Array | None,
-        state: NavigationState,
+        state: TaskState,
         action: int | float | jax.Array | None,
-        params: NavigationParams,
+        params: TaskParams,
     ) -> jax.Array:
         """`[O]` float32, see `observation.observe`, and the model's embedding of the ground."""
         del key, action
         routes = params.routes.select(state.route)
         return see(self.config, params.believed(state), routes, state)
 
-    def is_terminated(self, state: NavigationState, params: NavigationParams) -> jax.Array:
+    def is_terminated(self, state: TaskState, params: TaskParams) -> jax.Array:
         """Whether the task itself is over."""
         return is_terminal(state.ending)
 
-    def is_truncated(self, state: NavigationState, params: NavigationParams) -> jax.Array:
+    def is_truncated(self, state: TaskState, params: TaskParams) -> jax.Array:
         """Whether only the time is over: the value of the state that follows still counts."""
-        return state.ending == Ending.TIMED_OUT
+        return state.ending == TerminationReason.TIMED_OUT
 
     @property
     def num_actions(self) -> int:
         """Speed and steering."""
         return 2
 
-    def action_space(self, params: NavigationParams | None = None) -> spaces.Box:
+    def action_space(self, params: TaskParams | None = None) -> spaces.Box:
         """[-1, 1]^2."""
         return spaces.Box(-1.0, 1.0, (2,), jnp.float32)
 
-    def observation_space(self, params: NavigationParams | None = None) -> spaces.Box:
+    def observation_space(self, params: TaskParams | None = None) -> spaces.Box:
         """Every entry within the observation's limit."""
         limit, size = observation.OBSERVATION_LIMIT, observation.OBSERVATION_SIZE
         size += math.prod(self.senses.image or (0,))
@@ -203,8 +201,8 @@ class NavigationEnv(environment.Environment[NavigationState, NavigationParams]):
         return Senses(observation.ARCS, EMBEDDING_SHAPE if self.config.embeddings else None)
 
     @property
-    def _starts(self) -> Starts:
-        return Starts(self.dynamics, self.config, self.variation)
+    def _starts(self) -> ResetPool:
+        return ResetPool(self.dynamics, self.config, self.variation)
 
     def _is_plausible(
         self, terrain: TerrainMap, vehicle: VehicleState, apart: jax.Array

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.footprint import CROWN_SCALE, SLOPE_SCALE, TWIST_SCALE, footprint, places
 from vertiwm_jax.env.route import CLEARANCE, Routes
 from vertiwm_jax.env.termination import edge_distance
+from vertiwm_jax.env.traversability import CROWN_SCALE, SLOPE_SCALE, TWIST_SCALE, footprint, places
 from vertiwm_jax.networks.policy import Candidates, tiles
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import obstacles, query

@@ -6,7 +6,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.termination import TerminationReason
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +54,8 @@ def reward(
     """`[...]` reward of one 0.1 s step.
 
     progress: m by which the cost to go fell; distance: m left; stalled: bool; roll, pitch: rad;
-    vertical_speed: m/s in the world frame; disagreement, spread: m; ending: `Ending` codes.
+    vertical_speed: m/s in the world frame; disagreement, spread: m; ending: `TerminationReason`
+    codes.
     """
 
     def tilt_penalty(angle: jax.Array) -> jax.Array:
@@ -73,11 +74,11 @@ def reward(
 
 
 def ending_reward(config: RewardConfig, ending: jax.Array, distance: jax.Array) -> jax.Array:
-    """`[...]` of what an `Ending` code adds, `distance` m from the goal; 0 for `RUNNING`."""
+    """`[...]` what a `TerminationReason` adds, `distance` m from the goal; 0 for `RUNNING`."""
     named = {
-        Ending.RUNNING: 0.0,
-        Ending.TIMED_OUT: -config.timed_out - config.timed_out_distance * distance,
-        Ending.GOAL: config.goal,
-        Ending.STUCK: -config.stuck,
+        TerminationReason.RUNNING: 0.0,
+        TerminationReason.TIMED_OUT: -config.timed_out - config.timed_out_distance * distance,
+        TerminationReason.GOAL: config.goal,
+        TerminationReason.STUCK: -config.stuck,
     }
     return jnp.select([ending == code for code in named], list(named.values()), -config.failure)

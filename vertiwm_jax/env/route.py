@@ -17,8 +17,8 @@ from flax import struct
 from vertiwm_jax import devices
 from vertiwm_jax.config import Bounds, NotNegative, settings
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.footprint import Difficulty, footprint, places
 from vertiwm_jax.env.termination import edge_distance
+from vertiwm_jax.env.traversability import TraversabilityCost, footprint, places
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -43,7 +43,7 @@ class RouteConfig:
     """
 
     cells: Annotated[int, Bounds(4)] = 64
-    difficulty: Difficulty = Difficulty()
+    difficulty: TraversabilityCost = TraversabilityCost()
     detour: NotNegative = 2.0
     blocked: NotNegative = 10.0
 

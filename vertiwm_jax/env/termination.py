@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from vertiwm_jax.terrain.map import TerrainMap
 
 
-class Ending(enum.IntEnum):
+class TerminationReason(enum.IntEnum):
     """Why an episode is over; a time-out truncates, all after it terminate."""
 
     RUNNING = 0
@@ -21,7 +21,7 @@ class Ending(enum.IntEnum):
     DIVERGED = 7
 
 
-def first_ending(conditions: dict[Ending, jax.Array]) -> jax.Array:
+def first_ending(conditions: dict[TerminationReason, jax.Array]) -> jax.Array:
     """`[...]` int32 code of the gravest condition that holds, `RUNNING` if none does.
 
     Gravest is the largest code: a vehicle that reaches the goal upside down has rolled over.
@@ -30,13 +30,13 @@ def first_ending(conditions: dict[Ending, jax.Array]) -> jax.Array:
     return jnp.select(
         [conditions[ending] for ending in order],
         [jnp.int32(ending) for ending in order],
-        jnp.int32(Ending.RUNNING),
+        jnp.int32(TerminationReason.RUNNING),
     )
 
 
 def is_terminal(ending: jax.Array) -> jax.Array:
     """`[...]` whether the code ends the task itself and not only its time."""
-    return ending > Ending.TIMED_OUT
+    return ending > TerminationReason.TIMED_OUT
 
 
 def edge_distance(terrain: TerrainMap, xy: jax.Array) -> jax.Array:

@@ -12,10 +12,10 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax import devices
-from vertiwm_jax.env.driver import Driver, Policy, Reactive
-from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env.agent import Agent, Policy, Reactive
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.task import TaskParams, TaskState
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.state import STEP_SECONDS
 
 _TOGETHER = 8  # vehicles that a device decides for at a time
@@ -25,7 +25,7 @@ _TOGETHER = 8  # vehicles that a device decides for at a time
 class NavigationResult:
     """P episodes, one for each task of the pool.
 
-    ending: `[P]` int32 `Ending` codes.
+    ending: `[P]` int32 `TerminationReason` codes.
     steps: `[P]` int32, of 0.1 s.
     abs_roll, abs_pitch: `[P]` rad, mean over the steps of an episode.
     driven: `[P]` m along the path.
@@ -48,7 +48,7 @@ class NavigationResult:
     @property
     def success(self) -> jax.Array:
         """`[P]` whether the goal was reached."""
-        return self.ending == Ending.GOAL
+        return self.ending == TerminationReason.GOAL
 
     @property
     def seconds(self) -> jax.Array:
@@ -62,25 +62,25 @@ class NavigationResult:
 
 
 def evaluate(
-    env: NavigationEnv, params: NavigationParams, policy: Policy | Driver, key: jax.Array
+    env: NavigationEnv, params: TaskParams, policy: Policy | Agent, key: jax.Array
 ) -> NavigationResult:
     """Drives every task of the pool once, all at the same time, as one compiled program.
 
     Nothing is computed any more once the last episode has ended.
     """
-    driver = policy if isinstance(policy, Driver) else Reactive(policy)
+    driver = policy if isinstance(policy, Agent) else Reactive(policy)
     program = partial(_evaluate, env, int(params.max_steps_in_episode))
     return devices.shared_out(program, params.pool_size)(params, driver, key)
 
 
 @partial(jax.jit, static_argnames=("env", "length"))
 def _evaluate(
-    env: NavigationEnv, length: int, params: NavigationParams, driver: Driver, key: jax.Array
+    env: NavigationEnv, length: int, params: TaskParams, driver: Agent, key: jax.Array
 ) -> NavigationResult:
     count = params.pool_size
     observation, start = devices.spread(env.start, (None, 0))(params, jnp.arange(count))
 
-    def position_and_rpy(state: NavigationState) -> tuple[jax.Array, jax.Array]:
+    def position_and_rpy(state: TaskState) -> tuple[jax.Array, jax.Array]:
         return state.vehicle.position, state.vehicle.rpy
 
     paths = jax.tree.map(
@@ -89,13 +89,13 @@ def _evaluate(
 
     @partial(devices.spread, in_axes=(None, None, 0, 0, 0, 0))
     def drive(
-        driver: Driver,
-        params: NavigationParams,
+        driver: Agent,
+        params: TaskParams,
         memory: Any,
         observation: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         key: jax.Array,
-    ) -> tuple[Any, jax.Array, NavigationState]:
+    ) -> tuple[Any, jax.Array, TaskState]:
         key_policy, key_step = jax.random.split(key)
         action, memory = driver.act(params, memory, observation, state, key_policy)
         observation, state, *_ = env.step_env(key_step, state, action, params)
@@ -117,7 +117,7 @@ def _evaluate(
         return jax.lax.scan(advance, carry, length=driver.interval)[0]
 
     def unless_over(carry: tuple, _: None) -> tuple[tuple, None]:
-        running = jnp.any(carry[3].ending == Ending.RUNNING)
+        running = jnp.any(carry[3].ending == TerminationReason.RUNNING)
         return jax.lax.cond(running, drive_on, lambda over: over, carry), None
 
     # Steps after the time limit, to fill an interval, change nothing: all episodes are over.
@@ -150,11 +150,11 @@ def _evaluate(
 
 
 def _decide(
-    driver: Driver,
-    params: NavigationParams,
+    driver: Agent,
+    params: TaskParams,
     memory: Any,
     observation: jax.Array,
-    state: NavigationState,
+    state: TaskState,
     keys: jax.Array,
 ) -> Any:
     """Memories, leaves `[P, ...]`, with what those intend that still drive.
@@ -162,7 +162,7 @@ def _decide(
     Planners imagine many futures of each vehicle, so that a few at a time fill the devices, and
     none are imagined once a task is over.
     """
-    running = state.ending == Ending.RUNNING
+    running = state.ending == TerminationReason.RUNNING
     together = min(_TOGETHER * devices.number(), len(running))
     turns = -(-len(running) // together)
     # Those that drive come first, and the last turn is filled up with one that likely does not.
@@ -210,7 +210,7 @@ class Summary:
         success = np.asarray(result.success)
         steps = np.asarray(result.steps)
         seconds = np.asarray(result.seconds)[success]
-        counts = np.bincount(np.asarray(result.ending), minlength=len(Ending))
+        counts = np.bincount(np.asarray(result.ending), minlength=len(TerminationReason))
         return cls(
             tasks=len(success),
             successes=int(success.sum()),
@@ -220,7 +220,7 @@ class Summary:
             abs_roll=float(np.average(result.abs_roll, weights=steps)),
             abs_pitch=float(np.average(result.abs_pitch, weights=steps)),
             driven=float(np.mean(result.driven)),
-            endings={e.name.lower(): int(counts[e]) for e in Ending if counts[e]},
+            endings={e.name.lower(): int(counts[e]) for e in TerminationReason if counts[e]},
         )
 
 

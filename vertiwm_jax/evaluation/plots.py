@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vertiwm_jax import runs
-from vertiwm_jax.env import picture
+from vertiwm_jax.env import render
 from vertiwm_jax.terrain.map import TerrainMap
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def line(i: int) -> tuple[str, str]:
 
 
 def _draw_map(axes: Axes, terrain: TerrainMap, world: int) -> None:
-    axes.imshow(picture.shaded(terrain, world), extent=picture.extent(terrain))
+    axes.imshow(render.shaded(terrain, world), extent=render.extent(terrain))
     axes.grid(False)
     axes.set_xlabel("x [m], east")
     axes.set_ylabel("y [m], north")

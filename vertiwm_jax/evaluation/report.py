@@ -12,10 +12,11 @@ import jax
 import numpy as np
 
 from vertiwm_jax import runs
-from vertiwm_jax.env.driver import Driver, Policy
-from vertiwm_jax.env.episode import NavigationParams
+from vertiwm_jax.env import suites
+from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.task import TaskParams
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.evaluation.navigation import (
     NavigationResult,
@@ -23,18 +24,17 @@ from vertiwm_jax.evaluation.navigation import (
     evaluate,
     format_table,
 )
-from vertiwm_jax.rl import ground
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.map import TerrainMap
 
 Results = Mapping[str, NavigationResult]
-Judge = Callable[[NavigationEnv, NavigationParams, Policy | Driver, jax.Array], NavigationResult]
+Judge = Callable[[NavigationEnv, TaskParams, Policy | Agent, jax.Array], NavigationResult]
 
 
 def drive(
     env: NavigationEnv,
-    params: NavigationParams,
-    policies: Mapping[str, Policy | Driver],
+    params: TaskParams,
+    policies: Mapping[str, Policy | Agent],
     key: jax.Array,
     judge: Judge = evaluate,
 ) -> dict[str, Results]:
@@ -46,7 +46,7 @@ def drive(
         results[name] = judge(env, params, policy, key)
         solved, seconds = int(np.sum(results[name].success)), time.perf_counter() - start
         print(f"  {name}: {solved} solved, compiled and driven in {seconds:.0f} s", flush=True)
-    return by_suite(results, ground.suites(params.terrain))
+    return by_suite(results, suites.suites(params.terrain))
 
 
 def by_suite(results: Results, suites: Sequence[str]) -> dict[str, Results]:
@@ -116,7 +116,7 @@ def _episodes(groups: Mapping[str, Results]) -> list[dict[str, str | float]]:
             "world": int(result.world[i]),
             "goal_x": float(result.goal[i, 0]),
             "goal_y": float(result.goal[i, 1]),
-            "ending": Ending(int(result.ending[i])).name.lower(),
+            "ending": TerminationReason(int(result.ending[i])).name.lower(),
             "seconds": round(float(result.seconds[i]), 1),
             "abs_roll_deg": math.degrees(float(result.abs_roll[i])),
             "abs_pitch_deg": math.degrees(float(result.abs_pitch[i])),

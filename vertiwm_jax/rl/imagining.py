@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.dynamics import History, Params, step
-from vertiwm_jax.env.driver import Driver
-from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env.action_repeat import ActionRepeat, corrected
+from vertiwm_jax.env.agent import Agent
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.repeat import ActionRepeat, corrected
+from vertiwm_jax.env.task import TaskParams, TaskState
 
 
 @struct.dataclass
@@ -37,12 +37,12 @@ class Future:
     """
 
     observation: jax.Array
-    state: NavigationState
+    state: TaskState
     weight: jax.Array
     total: jax.Array
 
     @classmethod
-    def of(cls, observation: jax.Array, state: NavigationState) -> Self:
+    def of(cls, observation: jax.Array, state: TaskState) -> Self:
         """Nothing is imagined yet."""
         return cls(observation, state, jnp.float32(1), jnp.float32(0))
 
@@ -54,7 +54,7 @@ def around(usual: jax.Array, number: int, spread: float, key: jax.Array) -> jax.
 
 
 @struct.dataclass
-class Imagining(Driver):
+class Imagining(Agent):
     """Knows a model to imagine in, which needs not be the one that the vehicle really follows.
 
     Every decision is held for `interval` steps. Static like it: `discount`, for each decision;
@@ -71,7 +71,7 @@ class Imagining(Driver):
     env: NavigationEnv = struct.field(pytree_node=False)
     dynamics: Params
 
-    def start(self, params: NavigationParams, state: NavigationState) -> Plan:
+    def start(self, params: TaskParams, state: TaskState) -> Plan:
         """The model's first history, and no correction."""
         terrain = params.believed(state)
         history = self.env.dynamics.init(self.dynamics, terrain, state.vehicle)
@@ -79,10 +79,10 @@ class Imagining(Driver):
 
     def act(
         self,
-        params: NavigationParams,
+        params: TaskParams,
         memory: Plan,
         observation: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         key: jax.Array,
     ) -> tuple[jax.Array, Plan]:
         """The base, corrected as planned; the model's history follows the vehicle."""
@@ -95,9 +95,9 @@ class Imagining(Driver):
     @abstractmethod
     def imagine(
         self,
-        params: NavigationParams,
+        params: TaskParams,
         observation: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         candidate: jax.Array,
         key: jax.Array,
     ) -> jax.Array:
@@ -105,10 +105,10 @@ class Imagining(Driver):
 
     def returns(
         self,
-        params: NavigationParams,
+        params: TaskParams,
         memory: Plan,
         observation: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         candidates: jax.Array,
         key: jax.Array,
     ) -> jax.Array:
@@ -118,14 +118,14 @@ class Imagining(Driver):
         return each(params, observation, state, candidates, key)
 
     def inside(
-        self, params: NavigationParams, memory: Plan, state: NavigationState
-    ) -> tuple[NavigationParams, NavigationState]:
+        self, params: TaskParams, memory: Plan, state: TaskState
+    ) -> tuple[TaskParams, TaskState]:
         """The task as it is now, inside the model; what is believed of the map is true there."""
         params = replace(params, dynamics=self.dynamics, terrain=params.believed(state))
         return params, replace(state, history=memory.history, belief=None)
 
     def hold(
-        self, params: NavigationParams, future: Future, correction: jax.Array, key: jax.Array
+        self, params: TaskParams, future: Future, correction: jax.Array, key: jax.Array
     ) -> Future:
         """What one more decision `[2]` leads to, in the task inside the model."""
         env = ActionRepeat(self.env, self.interval, self.base)

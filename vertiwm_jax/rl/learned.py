@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.env.repeat import Controller, corrected
+from vertiwm_jax.env.action_repeat import Controller, corrected
 from vertiwm_jax.networks.policy import (
     ActionCritic,
     Actor,

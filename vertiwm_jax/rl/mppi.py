@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.config import Positive, settings
-from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.rl.imagining import Plan, around
 from vertiwm_jax.rl.open_loop import OpenLoop, OpenLoopConfig
 
@@ -34,10 +34,10 @@ class MPPI(OpenLoop):
 
     def decide(
         self,
-        params: NavigationParams,
+        params: TaskParams,
         memory: Plan,
         observation: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         key: jax.Array,
     ) -> Plan:
         """The plans' mean."""

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.config import Count, Discount, NotNegative, Positive, settings
-from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.rl.imagining import Future, Imagining, Plan
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.world_model.choice import Imagined
@@ -62,9 +62,9 @@ class OpenLoop(Imagining):
 
     def imagine(
         self,
-        params: NavigationParams,
+        params: TaskParams,
         observation: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         candidate: jax.Array,
         key: jax.Array,
     ) -> jax.Array:
@@ -77,7 +77,7 @@ class OpenLoop(Imagining):
         future, _ = jax.lax.scan(advance, Future.of(observation, state), (candidate, keys))
         return future.total + future.weight * self.expected(params, future.state)
 
-    def expected(self, params: NavigationParams, state: NavigationState) -> jax.Array:
+    def expected(self, params: TaskParams, state: TaskState) -> jax.Array:
         """The discounted return `[]` of going on by the route to the goal, at a steady pace."""
         reward, discount = self.env.config.reward, self.config.discount
         left = jnp.maximum(params.cost_to_go(state) - self.env.config.goal_radius, 0.0)

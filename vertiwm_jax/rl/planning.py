@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.config import Count, NotNegative, settings
-from vertiwm_jax.env.episode import NavigationParams, NavigationState
-from vertiwm_jax.env.repeat import Controller
+from vertiwm_jax.env.action_repeat import Controller
+from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.rl.imagining import Future, Imagining, Plan, around
 from vertiwm_jax.rl.learned import MeanAction, TwinValue, Value
 from vertiwm_jax.world_model.choice import ModelName
@@ -48,10 +48,10 @@ class Planner(Imagining):
 
     def decide(
         self,
-        params: NavigationParams,
+        params: TaskParams,
         memory: Plan,
         observation: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         key: jax.Array,
     ) -> Plan:
         """The first action of the best imagined future."""
@@ -63,9 +63,9 @@ class Planner(Imagining):
 
     def imagine(
         self,
-        params: NavigationParams,
+        params: TaskParams,
         observation: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         candidate: jax.Array,
         key: jax.Array,
     ) -> jax.Array:

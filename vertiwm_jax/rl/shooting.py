@@ -9,10 +9,10 @@ import optax
 from flax import struct
 
 from vertiwm_jax.config import Count, CountOrZero, Positive, settings
-from vertiwm_jax.env.episode import NavigationParams, NavigationState
 from vertiwm_jax.env.observation import distance_and_bearing
 from vertiwm_jax.env.reward import ending_reward
-from vertiwm_jax.env.termination import Ending, edge_distance
+from vertiwm_jax.env.task import TaskParams, TaskState
+from vertiwm_jax.env.termination import TerminationReason, edge_distance
 from vertiwm_jax.rl.imagining import Plan, around
 from vertiwm_jax.rl.open_loop import OpenLoop, OpenLoopConfig
 from vertiwm_jax.terrain import obstacles
@@ -62,10 +62,10 @@ class Shooting(OpenLoop):
 
     def decide(
         self,
-        params: NavigationParams,
+        params: TaskParams,
         memory: Plan,
         observation: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         key: jax.Array,
     ) -> Plan:
         """The best plan."""
@@ -78,14 +78,14 @@ class Shooting(OpenLoop):
         return replace(memory, corrections=plans[chosen])
 
     def worth(
-        self, params: NavigationParams, memory: Plan, state: NavigationState, plans: jax.Array
+        self, params: TaskParams, memory: Plan, state: TaskState, plans: jax.Array
     ) -> jax.Array:
         """`[N]` the `smooth_return` of plans `[N, D, 2]` from where the vehicle is."""
         params, state = self.inside(params, memory, state)
         return jax.vmap(self.smooth_return, (None, None, 0))(params, state, plans)
 
     def improve(
-        self, params: NavigationParams, memory: Plan, state: NavigationState, plans: jax.Array
+        self, params: TaskParams, memory: Plan, state: TaskState, plans: jax.Array
     ) -> jax.Array:
         """`[N, D, 2]` plans, each after `steps` of Adam up the gradient of its `smooth_return`.
 
@@ -105,9 +105,7 @@ class Shooting(OpenLoop):
         carry = plans, optimiser.init(plans)
         return jax.lax.scan(ascend, carry, length=self.config.steps)[0][0]
 
-    def smooth_return(
-        self, params: NavigationParams, state: NavigationState, plan: jax.Array
-    ) -> jax.Array:
+    def smooth_return(self, params: TaskParams, state: TaskState, plan: jax.Array) -> jax.Array:
         """`[]` like the return of a plan `[D, 2]`, but endings come by degrees.
 
         Where the task ends, at a distance or at an angle, an episode goes on here with a weight
@@ -124,7 +122,7 @@ class Shooting(OpenLoop):
             _, after, gain, _, _ = env.step_env(jax.random.key(0), before, action, params)
             distance, _ = distance_and_bearing(after.vehicle.position, after.goal)
             ended = ending_reward(reward, after.ending, distance)
-            gain = gain - jnp.where(before.ending == Ending.RUNNING, ended, 0.0)
+            gain = gain - jnp.where(before.ending == TerminationReason.RUNNING, ended, 0.0)
             remains = jnp.float32(1)
             for ending, share in self._nearness(terrain, after, distance).items():
                 gain = gain + share * ending_reward(reward, jnp.int32(ending), distance)
@@ -137,8 +135,8 @@ class Shooting(OpenLoop):
         return total + weight * self.expected(params, end)
 
     def _nearness(
-        self, terrain: TerrainMap, state: NavigationState, distance: jax.Array
-    ) -> dict[Ending, jax.Array]:
+        self, terrain: TerrainMap, state: TaskState, distance: jax.Array
+    ) -> dict[TerminationReason, jax.Array]:
         """`[]` from 0 to 1 for endings at a distance or an angle, 1/2 where the task draws them."""
         config, position = self.env.config, state.vehicle.position[:2]
         roll, pitch, yaw = state.vehicle.rpy
@@ -146,10 +144,10 @@ class Shooting(OpenLoop):
         chassis = config.chassis
         gap = obstacles.gap(terrain, position, yaw, chassis.length, chassis.width)
         beyond = {
-            Ending.GOAL: (config.goal_radius - distance) / self.config.clearance,
-            Ending.COLLIDED: -gap / self.config.clearance,
-            Ending.OFF_MAP: (config.map_margin - edge_distance(terrain, position))
+            TerminationReason.GOAL: (config.goal_radius - distance) / self.config.clearance,
+            TerminationReason.COLLIDED: -gap / self.config.clearance,
+            TerminationReason.OFF_MAP: (config.map_margin - edge_distance(terrain, position))
             / self.config.clearance,
-            Ending.ROLLED_OVER: (tilt - config.rollover_angle) / self.config.leeway,
+            TerminationReason.ROLLED_OVER: (tilt - config.rollover_angle) / self.config.leeway,
         }
         return {ending: jax.nn.sigmoid(x) for ending, x in beyond.items()}

@@ -8,18 +8,17 @@ import jax
 
 from vertiwm_jax import devices
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.env import tasks
+from vertiwm_jax.env import suites, tasks
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.episode import NavigationConfig, NavigationParams
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.randomization import RandomizationConfig
+from vertiwm_jax.env.suites import GroundConfig
+from vertiwm_jax.env.task import NavigationConfig, TaskParams
 from vertiwm_jax.env.tasks import Tasks
-from vertiwm_jax.env.termination import Ending
-from vertiwm_jax.env.variation import VariationConfig
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
-from vertiwm_jax.rl import ground
-from vertiwm_jax.rl.ground import GroundConfig
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.choice import (
     Imagined,
@@ -47,7 +46,7 @@ class TaskConfig:
     """What worlds and tasks."""
     navigation: NavigationConfig = NavigationConfig()
     """What the task is; a vehicle other than the HMMWV brings a chassis of its own."""
-    variation: VariationConfig = VariationConfig()
+    variation: RandomizationConfig = RandomizationConfig()
     """How episodes differ from what map and model say, while learning."""
     model: ModelName = "builtin"
     """What moves the vehicle while learning; tests after it are in the built-in simulator."""
@@ -93,7 +92,7 @@ class Task:
     """An environment and its parameters."""
 
     env: NavigationEnv
-    params: NavigationParams
+    params: TaskParams
 
 
 def training_environment(config: TaskConfig) -> tuple[Task, TerrainMap]:
@@ -111,11 +110,11 @@ def training_ground(config: TaskConfig) -> tuple[TerrainMap, Tasks, TerrainMap]:
     Maps that cannot be used, and tasks that cannot be driven on them, raise `ValueError`.
     """
     navigation, scale = config.asked, config.driven.scale
-    terrain, held_out = ground.grounds(config.ground, config.worlds, config.key("worlds"), scale)
+    terrain, held_out = suites.grounds(config.ground, config.worlds, config.key("worlds"), scale)
     # Now, and not when the training is over.
-    tests = ground.test_tasks(config.ground, held_out)
+    tests = suites.test_tasks(config.ground, held_out)
     tasks.validate(tests, held_out, navigation.goal_radius, navigation.map_margin)
-    pool = ground.training_tasks(config.ground, terrain, navigation.chassis, config.key("tasks"))
+    pool = suites.training_tasks(config.ground, terrain, navigation.chassis, config.key("tasks"))
     return terrain, pool, held_out
 
 
@@ -123,13 +122,13 @@ def held_out(config: TaskConfig) -> TerrainMap:
     """The worlds that `training_environment` holds out."""
     key, scale = config.key("worlds"), config.driven.scale
     if config.worlds is None:
-        return ground.suite_worlds(config.ground, key, scale)
-    return ground.grounds(config.ground, config.worlds, key, scale)[1]
+        return suites.suite_worlds(config.ground, key, scale)
+    return suites.grounds(config.ground, config.worlds, key, scale)[1]
 
 
 def test_environment(config: TaskConfig, terrain: TerrainMap, model: ModelName = "builtin") -> Task:
     """The test on these worlds, inside one of the models."""
-    return environment(config, model, terrain, ground.test_tasks(config.ground, terrain))
+    return environment(config, model, terrain, suites.test_tasks(config.ground, terrain))
 
 
 def environment(
@@ -137,7 +136,7 @@ def environment(
     model: ModelName,
     terrain: TerrainMap,
     pool: Tasks,
-    variation: VariationConfig = VariationConfig(),
+    variation: RandomizationConfig = RandomizationConfig(),
 ) -> Task:
     """Tasks inside one of the models."""
     moves, params = dynamics(config, model)
@@ -161,7 +160,7 @@ def outcomes(info: dict[str, jax.Array]) -> dict[str, jax.Array]:
     """What is reported of an episode's last step."""
     ending = info["ending"]
     return {
-        "success": ending == Ending.GOAL,
-        "timed_out": ending == Ending.TIMED_OUT,
+        "success": ending == TerminationReason.GOAL,
+        "timed_out": ending == TerminationReason.TIMED_OUT,
         "final_distance": info["distance"],
     }

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.env.episode import NavigationParams, NavigationState
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
@@ -45,10 +45,10 @@ def followed(env: NavigationEnv) -> NavigationEnv:
 def start(
     simulator: Simulator,
     env: NavigationEnv,
-    params: NavigationParams,
-    state: NavigationState,
+    params: TaskParams,
+    state: TaskState,
     pose: Sequence[float],
-) -> tuple[jax.Array, NavigationState]:
+) -> tuple[jax.Array, TaskState]:
     """Observation and state of an episode whose vehicle stands in `simulator`.
 
     state: a start of the pool, whose vehicle is replaced; pose: `[3]` x, y, m, and yaw, rad.
@@ -58,14 +58,14 @@ def start(
 
 
 def move(
-    simulator: Simulator, env: NavigationEnv, params: NavigationParams, action: jax.Array
-) -> NavigationParams:
+    simulator: Simulator, env: NavigationEnv, params: TaskParams, action: jax.Array
+) -> TaskParams:
     """Does the action `[2]` in `simulator`; `Followed` does the same with these parameters."""
     seen = simulator.step(np.asarray(env.config.command(action).vector))
     return _moved(params, jnp.asarray(seen.state))
 
 
-def _moved(params: NavigationParams, state: jax.Array) -> NavigationParams:
+def _moved(params: TaskParams, state: jax.Array) -> TaskParams:
     dynamics = params.dynamics
     if isinstance(dynamics, SightedParams):
         return replace(params, dynamics=replace(dynamics, dynamics=state))
@@ -74,8 +74,8 @@ def _moved(params: NavigationParams, state: jax.Array) -> NavigationParams:
 
 @partial(jax.jit, static_argnames="env")
 def _begin(
-    env: NavigationEnv, params: NavigationParams, state: NavigationState, seen: jax.Array
-) -> tuple[jax.Array, NavigationState]:
+    env: NavigationEnv, params: TaskParams, state: TaskState, seen: jax.Array
+) -> tuple[jax.Array, TaskState]:
     vehicle, terrain = VehicleState.from_vector(seen), params.terrain.select(state.world)
     history = env.dynamics.init(params.dynamics, terrain, vehicle)
     state = replace(state, vehicle=vehicle, history=history)

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.env.episode import NavigationConfig, NavigationState
 from vertiwm_jax.env.gymnasium import NavigationGymEnv
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.task import NavigationConfig, TaskState
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.simulators import following
 from vertiwm_jax.simulators.following import Followed
@@ -47,7 +47,7 @@ class SimulatorEnv(NavigationGymEnv):
             )
         return super().step(action)
 
-    def _start(self) -> tuple[jax.Array, NavigationState]:
+    def _start(self) -> tuple[jax.Array, TaskState]:
         _, state = super()._start()
         self._simulator = self._make(self._params.terrain.select(state.world))
         x, y, _ = state.vehicle.position.tolist()

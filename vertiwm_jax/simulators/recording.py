@@ -11,7 +11,7 @@ import numpy as np
 
 from vertiwm_jax.learning import schema
 from vertiwm_jax.mechanics.vehicle import Vehicle
-from vertiwm_jax.simulators.pilots import MARGIN, Pilot, within
+from vertiwm_jax.simulators.excitation import MARGIN, Pilot, within
 from vertiwm_jax.simulators.protocol import Observation, Simulator
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.map import TerrainMap

@@ -5,10 +5,10 @@ from functools import partial
 import jax
 import numpy as np
 
-from vertiwm_jax.env.driver import Driver, Memory, Policy, Reactive
-from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env.agent import Agent, Memory, Policy, Reactive
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.task import TaskParams, TaskState
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation.wheels import modelled
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.viewing.scene import Scene
@@ -16,18 +16,18 @@ from vertiwm_jax.viewing.scene import Scene
 
 def drive(
     env: NavigationEnv,
-    params: NavigationParams,
-    policy: Policy | Driver,
+    params: TaskParams,
+    policy: Policy | Agent,
     key: jax.Array,
     name: str,
 ) -> Scene:
     """Drives the first task of the pool to its end; `name` is that of the policy, for the title."""
-    driver = policy if isinstance(policy, Driver) else Reactive(policy)
+    driver = policy if isinstance(policy, Agent) else Reactive(policy)
     observation, state = env.start(params, jax.numpy.int32(0))
     memory = driver.start(params, state)
     rows = [_row(env, state)]
     for step in range(int(params.max_steps_in_episode)):
-        if state.ending != Ending.RUNNING:
+        if state.ending != TerminationReason.RUNNING:
             break
         keys = jax.random.split(jax.random.fold_in(key, step), 3)
         if step % driver.interval == 0:
@@ -37,7 +37,7 @@ def drive(
         )
         rows.append(_row(env, state))
     vehicle, command, wheels, alpha = jax.tree.map(lambda *x: np.stack(x), *rows)
-    ending = Ending(int(state.ending)).name.lower().replace("_", " ")
+    ending = TerminationReason(int(state.ending)).name.lower().replace("_", " ")
     return Scene(
         title=f"{name}: {ending}, {STEP_SECONDS * int(state.time):.1f} s",
         terrain=params.terrain.select(state.world),
@@ -50,7 +50,7 @@ def drive(
     )
 
 
-def _row(env: NavigationEnv, state: NavigationState) -> tuple:
+def _row(env: NavigationEnv, state: TaskState) -> tuple:
     """What is kept of a step: the state, the command that led there, wheels and coefficients."""
     command = env.config.command(state.action).vector
     alpha = getattr(state.history, "coefficients", None)
@@ -59,11 +59,11 @@ def _row(env: NavigationEnv, state: NavigationState) -> tuple:
 
 @jax.jit
 def _decide(
-    driver: Driver,
-    params: NavigationParams,
+    driver: Agent,
+    params: TaskParams,
     memory: Memory,
     observation: jax.Array,
-    state: NavigationState,
+    state: TaskState,
     key: jax.Array,
 ) -> Memory:
     return driver.decide(params, memory, observation, state, key)
@@ -72,13 +72,13 @@ def _decide(
 @partial(jax.jit, static_argnames="env")
 def _advance(
     env: NavigationEnv,
-    driver: Driver,
-    params: NavigationParams,
+    driver: Agent,
+    params: TaskParams,
     memory: Memory,
     observation: jax.Array,
-    state: NavigationState,
+    state: TaskState,
     keys: jax.Array,
-) -> tuple[Memory, jax.Array, NavigationState]:
+) -> tuple[Memory, jax.Array, TaskState]:
     action, memory = driver.act(params, memory, observation, state, keys[0])
     observation, state, *_ = env.step_env(keys[1], state, action, params)
     return memory, observation, state

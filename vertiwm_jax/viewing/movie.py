@@ -10,7 +10,7 @@ import numpy as np
 
 from vertiwm_jax import runs
 from vertiwm_jax.config import ConfigError
-from vertiwm_jax.env import picture
+from vertiwm_jax.env import render
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.viewing.scene import FUSION, TILT, Scene, panels
@@ -86,8 +86,8 @@ def _draw_map(axes: Axes, scene: Scene) -> Show:
     from matplotlib.patches import Circle, Polygon
 
     terrain, vehicle, prediction = scene.terrain, scene.vehicle, scene.prediction
-    extent = picture.extent(terrain)
-    axes.imshow(picture.shaded(terrain, scene.world), extent=extent, interpolation="nearest")
+    extent = render.extent(terrain)
+    axes.imshow(render.shaded(terrain, scene.world), extent=extent, interpolation="nearest")
     axes.grid(False)
     axes.set(xlabel="x [m], east", ylabel="y [m], north")
     if scene.goal is not None:
@@ -143,7 +143,7 @@ def _middles(scene: Scene) -> np.ndarray:
 
     It stays where it is until the vehicle comes near its edge: a GIF then holds only what moves.
     """
-    west, east, south, north = picture.extent(scene.terrain)
+    west, east, south, north = render.extent(scene.terrain)
     low, high = np.array([west, south]) + REACH, np.array([east, north]) - REACH
     middles = [np.clip(scene.state[0, :2], low, high)]
     for place in scene.state[1:, :2]:

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from vertiwm_jax import geometry, runs
-from vertiwm_jax.env import picture
+from vertiwm_jax.env import render
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.terrain import query
 from vertiwm_jax.viewing.scene import WHEELS, Scene, panels
@@ -58,14 +58,14 @@ def _ground(stream: rr.RecordingStream, scene: Scene) -> None:
     terrain = scene.terrain
     elevation = np.asarray(terrain.elevation[scene.world])
     rows, columns = elevation.shape
-    west, east, south, north = picture.extent(terrain)
+    west, east, south, north = render.extent(terrain)
     u, v = np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, rows))
     x, y = west + u * (east - west), north - v * (north - south)
     # The corners of each cell: north-west, north-east, south-west, south-east.
     number = np.arange(rows * columns).reshape(rows, columns)
     lower, upper = slice(1, None), slice(None, -1)
     nw, ne, sw, se = (number[i, j].ravel() for i in (upper, lower) for j in (upper, lower))
-    image = (255 * picture.shaded(terrain, scene.world)).round().astype(np.uint8)
+    image = (255 * render.shaded(terrain, scene.world)).round().astype(np.uint8)
     log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     log(
         "world/terrain",

@@ -1,4 +1,4 @@
-"""A policy is judged outside jit as it is inside."""
+"""A policy is judged external jit as it is inside."""
 
 import jax
 import jax.numpy as jnp
@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from env.worlds import SNOW, hills
 
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import Tasks
-from vertiwm_jax.env.termination import Ending
-from vertiwm_jax.evaluation import navigation, outside
+from vertiwm_jax.env.termination import TerminationReason as Reason
+from vertiwm_jax.evaluation import external, navigation
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.simulators import processes
@@ -39,8 +39,12 @@ def test_the_built_in_simulator_outside_jit_is_that_inside(jobs):
     arguments = env, params, jax.tree_util.Partial(led_by_embedding), jax.random.key(0)
     inside = navigation.evaluate(*arguments)
     with processes.simulating(jobs) as mapped:
-        found = outside.evaluate(BuiltIn, mapped, tasks, *arguments)
-    assert found.ending.tolist() == [Ending.GOAL, Ending.COLLIDED, Ending.TIMED_OUT]
+        found = external.evaluate(BuiltIn, mapped, tasks, *arguments)
+    assert found.ending.tolist() == [
+        Reason.GOAL,
+        Reason.COLLIDED,
+        Reason.TIMED_OUT,
+    ]
     for name in ("ending", "steps", "world"):
         np.testing.assert_array_equal(getattr(found, name), getattr(inside, name))
     for name in ("position", "rpy", "abs_roll", "abs_pitch", "driven", "final_distance"):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rl.probes import Delayed, ProbeParams
 
-from vertiwm_jax.env.repeat import ActionRepeat
+from vertiwm_jax.env.action_repeat import ActionRepeat
 
 KEY, ACTION = jax.random.key(0), jnp.ones(1)
 ENV = Delayed(steps=5)  # rewards 0, 1, 2, 3, 4

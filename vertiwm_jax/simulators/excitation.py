@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax.env import observation
-from vertiwm_jax.env.driver import Policy
-from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.agent import Policy
 from vertiwm_jax.env.route import Routes
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import jax
 from flax import struct
 
-from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env.task import TaskParams, TaskState
 
 Memory = Any
 
@@ -21,7 +21,7 @@ class Policy(Protocol):
     def __call__(self, observation: jax.Array, key: jax.Array) -> jax.Array: ...
 
 
-class Driver(ABC):
+class Agent(ABC):
     """Decides every `interval` steps and acts at each, and carries a memory of its own.
 
     A pytree, like a `Policy`; `interval` is static. It sees the state that the task is in, which
@@ -31,16 +31,16 @@ class Driver(ABC):
 
     interval = 1
 
-    def start(self, params: NavigationParams, state: NavigationState) -> Memory:
+    def start(self, params: TaskParams, state: TaskState) -> Memory:
         """The memory at the beginning of an episode; none, by default."""
         return None
 
     def decide(
         self,
-        params: NavigationParams,
+        params: TaskParams,
         memory: Memory,
         observation: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         key: jax.Array,
     ) -> Memory:
         """The memory with what is intended for the next `interval` steps; by default as it is."""
@@ -49,27 +49,27 @@ class Driver(ABC):
     @abstractmethod
     def act(
         self,
-        params: NavigationParams,
+        params: TaskParams,
         memory: Memory,
         observation: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         key: jax.Array,
     ) -> tuple[jax.Array, Memory]:
         """A `[2]` action in [-1, 1], and the memory after it."""
 
 
 @struct.dataclass
-class Reactive(Driver):
+class Reactive(Agent):
     """A policy as a driver: it acts on what it sees, and remembers nothing."""
 
     policy: Policy
 
     def act(
         self,
-        params: NavigationParams,
+        params: TaskParams,
         memory: None,
         observation: jax.Array,
-        state: NavigationState,
+        state: TaskState,
         key: jax.Array,
     ) -> tuple[jax.Array, None]:
         """What the policy says."""

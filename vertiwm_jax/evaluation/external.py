@@ -9,16 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax.config import ConfigError
-from vertiwm_jax.env.driver import Driver, Memory, Policy, Reactive
-from vertiwm_jax.env.episode import NavigationParams, NavigationState
+from vertiwm_jax.env import suites
+from vertiwm_jax.env.agent import Agent, Memory, Policy, Reactive
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.tasks import Tasks
-from vertiwm_jax.env.termination import Ending
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.evaluation.navigation import NavigationResult
 from vertiwm_jax.evaluation.report import Judge
 from vertiwm_jax.mechanics.vehicle import HMMWV
-from vertiwm_jax.rl import ground, task
+from vertiwm_jax.rl import task
 from vertiwm_jax.rl.task import Task, TaskConfig
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.simulators import chrono, following
@@ -49,7 +50,7 @@ def judge_in(arena: Arena, config: TaskConfig, terrain: TerrainMap, mapped: Map)
     """What drives the tasks of `test_in`; mapped: as in `evaluate`, for Chrono."""
     if arena != "chrono":
         return navigation.evaluate
-    return partial(evaluate, Chrono, mapped, ground.test_tasks(config.ground, terrain))
+    return partial(evaluate, Chrono, mapped, suites.test_tasks(config.ground, terrain))
 
 
 def evaluate(
@@ -57,8 +58,8 @@ def evaluate(
     mapped: Map,
     tasks: Tasks,
     env: NavigationEnv,
-    params: NavigationParams,
-    policy: Policy | Driver,
+    params: TaskParams,
+    policy: Policy | Agent,
     key: jax.Array,
 ) -> NavigationResult:
     """As `navigation.evaluate`, with the vehicle in `simulator` on the world of each task.
@@ -66,7 +67,7 @@ def evaluate(
     mapped: of `processes.simulating`; tasks: of which `params` has the starts.
     """
     env = following.followed(env)
-    driver = policy if isinstance(policy, Driver) else Reactive(policy)
+    driver = policy if isinstance(policy, Agent) else Reactive(policy)
     own = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(params.pool_size))
     shared = jax.device_get((tasks, params, driver, jax.random.key_data(own)))
     one, episodes = partial(_drive, simulator, env, *shared), []
@@ -81,8 +82,8 @@ def _drive(
     simulator: Callable[[TerrainMap], Simulator],
     env: NavigationEnv,
     tasks: Tasks,
-    params: NavigationParams,
-    driver: Driver,
+    params: TaskParams,
+    driver: Agent,
     keys: np.ndarray,
     number: int,
 ) -> NavigationResult:
@@ -99,16 +100,16 @@ def _drive(
 def _episode(
     simulator: Simulator,
     env: NavigationEnv,
-    params: NavigationParams,
-    driver: Driver,
+    params: TaskParams,
+    driver: Agent,
     observation: jax.Array,
-    state: NavigationState,
+    state: TaskState,
     key: jax.Array,
 ) -> NavigationResult:
     """One episode, leaves without the axis of tasks."""
     memory, length = driver.start(params, state), int(params.max_steps_in_episode)
     path = [np.concatenate([state.vehicle.position, state.vehicle.rpy])]
-    while state.ending == Ending.RUNNING:
+    while state.ending == TerminationReason.RUNNING:
         step = len(path) - 1
         deciding, acting = jax.random.split(jax.random.fold_in(key, step))
         if step % driver.interval == 0:
@@ -135,24 +136,22 @@ def _episode(
 
 
 @jax.jit
-def _decide(driver: Driver, params: NavigationParams, memory: Memory, *rest: Any) -> Memory:
+def _decide(driver: Agent, params: TaskParams, memory: Memory, *rest: Any) -> Memory:
     return driver.decide(params, memory, *rest)
 
 
 @jax.jit
-def _act(
-    driver: Driver, params: NavigationParams, memory: Memory, *rest: Any
-) -> tuple[jax.Array, Memory]:
+def _act(driver: Agent, params: TaskParams, memory: Memory, *rest: Any) -> tuple[jax.Array, Memory]:
     return driver.act(params, memory, *rest)
 
 
 @partial(jax.jit, static_argnames="env")
 def _follow(
     env: NavigationEnv,
-    params: NavigationParams,
-    state: NavigationState,
+    params: TaskParams,
+    state: TaskState,
     action: jax.Array,
     key: jax.Array,
-) -> tuple[jax.Array, NavigationState]:
+) -> tuple[jax.Array, TaskState]:
     """Observation and state of the task after the vehicle has moved."""
     return env.step_env(key, state, action, params)[:2]

@@ -6,9 +6,9 @@ from env.worlds import GRASS
 
 from vertiwm_jax.env import route
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.episode import NavigationConfig
+from vertiwm_jax.env.controllers import LookAhead
 from vertiwm_jax.env.observation import observe
-from vertiwm_jax.evaluation.controllers import LookAhead
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 

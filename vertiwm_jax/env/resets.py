@@ -10,10 +10,10 @@ import numpy as np
 from vertiwm_jax import devices, xla
 from vertiwm_jax.dynamics import Dynamics, History, Params, step
 from vertiwm_jax.env import route, tasks
-from vertiwm_jax.env.episode import NavigationConfig, NavigationParams, NavigationState, see
+from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
 from vertiwm_jax.env.route import Routes
+from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState, see
 from vertiwm_jax.env.tasks import Tasks
-from vertiwm_jax.env.variation import Variation, VariationConfig
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query, reveal
 from vertiwm_jax.terrain.map import TerrainMap
@@ -23,7 +23,7 @@ _TOGETHER = 64  # vehicles on a device, of which each has patches in every step
 
 
 @dataclasses.dataclass(frozen=True)
-class Starts:
+class ResetPool:
     """How the pool of starts of an environment is made; static.
 
     dynamics, config, variation: the environment's.
@@ -31,9 +31,9 @@ class Starts:
 
     dynamics: Dynamics
     config: NavigationConfig
-    variation: VariationConfig
+    variation: RandomizationConfig
 
-    def settled(self, weights: Params, terrain: TerrainMap, pool: Tasks) -> NavigationParams:
+    def settled(self, weights: Params, terrain: TerrainMap, pool: Tasks) -> TaskParams:
         """As `NavigationEnv.make_params`."""
         config = self.config
         self._check(terrain, pool)
@@ -57,7 +57,7 @@ class Starts:
             )
         return self._params(weights, terrain, routes, states, seen)
 
-    def shapes(self, weights: Params, terrain: TerrainMap, pool: Tasks) -> NavigationParams:
+    def shapes(self, weights: Params, terrain: TerrainMap, pool: Tasks) -> TaskParams:
         """As `NavigationEnv.shapes`."""
         self._check(terrain, pool)
         routes = route.straight(self.config.route, terrain, pool.goal)
@@ -81,10 +81,10 @@ class Starts:
         weights: Params,
         terrain: TerrainMap,
         routes: Routes,
-        states: NavigationState,
+        states: TaskState,
         seen: jax.Array,
-    ) -> NavigationParams:
-        return NavigationParams(
+    ) -> TaskParams:
+        return TaskParams(
             max_steps_in_episode=jnp.int32(round(self.config.horizon_seconds / STEP_SECONDS)),
             dynamics=weights,
             terrain=terrain,
@@ -103,13 +103,13 @@ def _in_turns(pool: Tasks) -> tuple[int, tuple[Tasks, jax.Array]]:
 
 @partial(jax.jit, static_argnames="starts")
 def _settle(
-    starts: Starts,
+    starts: ResetPool,
     dynamics: Params,
     terrain: TerrainMap,
     routes: Routes,
     pool: Tasks,
     numbers: jax.Array,
-) -> tuple[NavigationState, jax.Array]:
+) -> tuple[TaskState, jax.Array]:
     """States and observations of vehicles at rest, leaves `[P, ...]` and `[P, O]`; numbers `[P]`
     are of their routes."""
     model, config = starts.dynamics, starts.config
@@ -129,11 +129,11 @@ def _settle(
 
     def start(
         terrain: TerrainMap, routes: Routes, task: Tasks, number: jax.Array, settled: _Placed
-    ) -> tuple[NavigationState, jax.Array]:
+    ) -> tuple[TaskState, jax.Array]:
         vehicle, history = settled
         selected = terrain.select(task.world)
         zero, action = jnp.int32(0), config.action(standing())
-        state = NavigationState(
+        state = TaskState(
             time=zero,
             vehicle=vehicle,
             history=history,
@@ -143,7 +143,7 @@ def _settle(
             action=action,
             stalled=zero,
             ending=zero,
-            variation=Variation.draw(starts.variation, jax.random.key(0), action),
+            variation=DomainRandomization.draw(starts.variation, jax.random.key(0), action),
             belief=reveal.begin(config.reveal, selected, vehicle.position, vehicle.rpy[2]),
         )
         believed = dataclasses.replace(selected, belief=state.belief)

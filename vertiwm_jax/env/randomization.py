@@ -17,7 +17,7 @@ _STRENGTH = "kc", "kphi", "cohesion"
 
 
 @dataclasses.dataclass(frozen=True)
-class VariationConfig:
+class RandomizationConfig:
     """Least and most of what each episode draws evenly; nothing varies by default."""
 
     grip: tuple[float, float] = (1.0, 1.0)
@@ -37,7 +37,7 @@ class VariationConfig:
 
 
 @struct.dataclass
-class Variation:
+class DomainRandomization:
     """What one episode has drawn; None stands for what does not vary.
 
     grip, soil: `[]` factors. delay: `[]` int32 steps. sent: `[D, 2]` the last actions, the latest
@@ -50,7 +50,7 @@ class Variation:
     sent: jax.Array | None
 
     @classmethod
-    def draw(cls, config: VariationConfig, key: jax.Array, action: jax.Array) -> Self:
+    def draw(cls, config: RandomizationConfig, key: jax.Array, action: jax.Array) -> Self:
         """That of an episode before which `[2]` action was sent."""
         grip, soil, delay = jax.random.split(key, 3)
 

@@ -7,9 +7,9 @@ import pytest
 from env.worlds import BICYCLE, bicycle_env, ground, task
 
 from vertiwm_jax.dynamics import rollout
-from vertiwm_jax.env.episode import NavigationConfig
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.variation import Variation, VariationConfig
+from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
@@ -28,7 +28,7 @@ def varied(config):
 
 
 def test_episodes_draw_from_all_of_the_ranges():
-    config = VariationConfig(grip=(0.5, 0.9), soil=(0.4, 1.2), delay=(1, 3))
+    config = RandomizationConfig(grip=(0.5, 0.9), soil=(0.4, 1.2), delay=(1, 3))
     env, params = varied(config)
     drawn = jax.jit(jax.vmap(env.reset_env, (0, None)))(KEYS, params)[1].variation
     for factors, (low, high) in ((drawn.grip, config.grip), (drawn.soil, config.soil)):
@@ -46,7 +46,7 @@ def test_nothing_varies_by_default():
 @pytest.mark.parametrize("delay", [0, 1, 3])
 def test_commands_come_late(delay):
     """A delayed vehicle does what one without a delay has done before."""
-    env, params = varied(VariationConfig(delay=(delay, delay)))
+    env, params = varied(RandomizationConfig(delay=(delay, delay)))
     prompt_env, prompt = bicycle_env(FLAT, TASK)
     actions = jax.random.uniform(KEYS[0], (8, 2), minval=-1.0, maxval=1.0)
 
@@ -64,7 +64,7 @@ def test_commands_come_late(delay):
 
 
 def test_grip_scales_friction_and_soil_its_strength_wherever_the_ground_is_asked():
-    variation = Variation(jnp.float32(0.5), jnp.float32(0.25), delay=None, sent=None)
+    variation = DomainRandomization(jnp.float32(0.5), jnp.float32(0.25), delay=None, sent=None)
     below = jnp.array([3.0, 4.0])
     grip = [query.surface(x, below).friction for x in (FLAT, variation.ground(FLAT))]
     np.testing.assert_allclose(grip[1], 0.5 * grip[0], rtol=1e-6)
@@ -100,4 +100,4 @@ def test_a_vehicle_climbs_less_on_varied_ground():
 @pytest.mark.parametrize("wrong", [{"grip": (0.9, 0.5)}, {"soil": (0.0, 1.0)}, {"delay": (-1, 2)}])
 def test_ranges_without_sense_are_refused(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}: expected least and most"):
-        VariationConfig(**wrong)
+        RandomizationConfig(**wrong)

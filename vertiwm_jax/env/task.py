@@ -15,9 +15,9 @@ from vertiwm_jax.dynamics import (
 )
 from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env.randomization import DomainRandomization
 from vertiwm_jax.env.reward import RewardConfig
 from vertiwm_jax.env.route import RouteConfig, Routes
-from vertiwm_jax.env.variation import Variation
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.map import TerrainMap
@@ -88,14 +88,14 @@ class NavigationConfig:
 
 
 @struct.dataclass(kw_only=True)
-class NavigationState(environment.EnvState):
+class TaskState(environment.EnvState):
     """One episode under way.
 
     vehicle, history: the model's.
     world: `[]` int32; goal: `[3]` m; route: `[]` int32, which of all routes leads there.
     action: `[2]` the last one, in [-1, 1].
     time: `[]` int32 steps done; stalled: `[]` int32 steps stalled without a break.
-    ending: `[]` int32 `Ending` code.
+    ending: `[]` int32 `TerminationReason` code.
     variation: how this episode differs from what the map says.
     belief: what the vehicle has seen of its world; None where it knows all of the map.
     """
@@ -108,12 +108,12 @@ class NavigationState(environment.EnvState):
     action: jax.Array
     stalled: jax.Array
     ending: jax.Array
-    variation: Variation
+    variation: DomainRandomization
     belief: MapBelief | None = None
 
 
 @struct.dataclass(kw_only=True)
-class NavigationParams(environment.EnvParams):
+class TaskParams(environment.EnvParams):
     """What an environment is run with: arrays, so that nothing here is compiled in.
 
     dynamics: the model's parameters.
@@ -125,7 +125,7 @@ class NavigationParams(environment.EnvParams):
     dynamics: Params
     terrain: TerrainMap
     routes: Routes
-    starts: NavigationState
+    starts: TaskState
     start_observation: jax.Array
 
     @property
@@ -133,12 +133,12 @@ class NavigationParams(environment.EnvParams):
         """P, the number of starts."""
         return self.start_observation.shape[0]
 
-    def cost_to_go(self, state: NavigationState) -> jax.Array:
+    def cost_to_go(self, state: TaskState) -> jax.Array:
         """`[]` m of level ground that the way to the goal costs from where the vehicle is."""
         routes, position = self.routes.select(state.route), state.vehicle.position
         return routes.cost_to_go(self.terrain, position[:2])
 
-    def believed(self, state: NavigationState) -> TerrainMap:
+    def believed(self, state: TaskState) -> TerrainMap:
         """The world of an episode as far as its vehicle has seen it: what may drive it by."""
         terrain = self.terrain.select(state.world)
         if state.belief is None:
@@ -147,7 +147,7 @@ class NavigationParams(environment.EnvParams):
 
 
 def see(
-    config: NavigationConfig, terrain: TerrainMap, routes: Routes, state: NavigationState
+    config: NavigationConfig, terrain: TerrainMap, routes: Routes, state: TaskState
 ) -> jax.Array:
     """`[O]` float32, see `observation.observe`, and the model's embedding of the ground.
 

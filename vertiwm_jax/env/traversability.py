@@ -56,7 +56,7 @@ def footprint(chassis: Chassis, heights: jax.Array) -> Footprint:
 
 
 @dataclass(frozen=True)
-class Difficulty:
+class TraversabilityCost:
     """What makes ground hard to drive.
 
     bank, rise, twist, crown: weights of the squares of what a `Footprint` has.

@@ -4,9 +4,9 @@ import jax
 import numpy as np
 import pytest
 
+from vertiwm_jax.env import suites
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.rl import ground
-from vertiwm_jax.rl.ground import GroundConfig
+from vertiwm_jax.env.suites import GroundConfig
 from vertiwm_jax.rl.task import TaskConfig
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
@@ -23,7 +23,7 @@ def plane(slope_deg: float, size: int = 17) -> terrain_map.TerrainMap:
 
 @pytest.fixture(scope="module")
 def procedural():
-    return ground.grounds(CONFIG, None, jax.random.key(0))
+    return suites.grounds(CONFIG, None, jax.random.key(0))
 
 
 def test_procedural_worlds_are_never_both_trained_and_tested_on(procedural):
@@ -34,14 +34,14 @@ def test_procedural_worlds_are_never_both_trained_and_tested_on(procedural):
 
 def test_procedural_worlds_have_the_difficulty_they_were_drawn_with(procedural):
     train, held_out = procedural
-    assert ground.difficulties(train) == ["mid", "high", "mid"]
-    assert ground.difficulties(held_out) == ["low", "mid", "high", "high", "low", "mid"]
-    assert ground.suites(held_out) == ["easy"] * 2 + ["hard"] * 2 + ["obstacles"] * 2
+    assert suites.difficulties(train) == ["mid", "high", "mid"]
+    assert suites.difficulties(held_out) == ["low", "mid", "high", "high", "low", "mid"]
+    assert suites.suites(held_out) == ["easy"] * 2 + ["hard"] * 2 + ["obstacles"] * 2
 
 
 def test_a_suite_alone_has_the_same_worlds(procedural):
     alone = replace(CONFIG, suites=("obstacles",))
-    _, terrain = ground.grounds(alone, None, jax.random.key(0))
+    _, terrain = suites.grounds(alone, None, jax.random.key(0))
     np.testing.assert_array_equal(terrain.elevation, procedural[1].elevation[4:])
     np.testing.assert_array_equal(terrain.obstacles, procedural[1].obstacles[4:])
     with pytest.raises(ValueError, match="suites: expected some of easy, hard, obstacles"):
@@ -53,7 +53,7 @@ def test_the_suite_of_a_map_is_that_of_its_slope_and_obstacles():
     flat, steep = plane(0), plane(20)
     both = [replace(terrain, obstacles=rock[None]) for terrain in (flat, steep)]
     terrain = terrain_map.stack([flat, steep, *both])
-    assert ground.suites(terrain) == ["easy", "hard", "obstacles", "hard, obstacles"]
+    assert suites.suites(terrain) == ["easy", "hard", "obstacles", "hard, obstacles"]
 
 
 def test_every_so_manieth_map_is_held_out(tmp_path):
@@ -61,7 +61,7 @@ def test_every_so_manieth_map_is_held_out(tmp_path):
     for i, slope in enumerate(slopes):
         files.save(plane(slope), tmp_path / f"{i}.npz")
     config = replace(CONFIG, held_out_every=3)
-    train, held_out = ground.grounds(config, tmp_path, jax.random.key(0))
+    train, held_out = suites.grounds(config, tmp_path, jax.random.key(0))
 
     def found(terrain):
         rise = np.asarray(terrain.elevation[:, 0, 1] - terrain.elevation[:, 0, 0])
@@ -70,24 +70,24 @@ def test_every_so_manieth_map_is_held_out(tmp_path):
     assert found(held_out) == [2, 5] and found(train) == [0, 1, 3, 4, 6]
     assert train.semantic.shape[0] == train.friction.shape[0] == train.obstacles.shape[0] == 5
     with pytest.raises(ValueError, match="expected at most the 7 worlds found, is 8"):
-        ground.grounds(replace(config, held_out_every=8), tmp_path, jax.random.key(0))
+        suites.grounds(replace(config, held_out_every=8), tmp_path, jax.random.key(0))
 
 
 def test_difficulty_is_the_nearest_preset():
     terrain = terrain_map.stack([plane(slope) for slope in (0, 8.5, 8.6, 18.5, 40)])
-    assert ground.difficulties(terrain) == ["low", "low", "mid", "high", "extreme"]
+    assert suites.difficulties(terrain) == ["low", "low", "mid", "high", "extreme"]
 
 
 def test_tasks_cross_every_world_and_start_anywhere(procedural):
     train, held_out = procedural
-    across = ground.test_tasks(CONFIG, held_out)
+    across = suites.test_tasks(CONFIG, held_out)
     assert np.bincount(np.asarray(across.world)).tolist() == [4] * 6
     np.testing.assert_allclose(np.linalg.norm(across.start, axis=-1), 60, rtol=1e-5)
     np.testing.assert_allclose(across.goal, -np.asarray(across.start), atol=1e-3)
-    tasks = ground.training_tasks(CONFIG, train, Chassis(), jax.random.key(1))
+    tasks = suites.training_tasks(CONFIG, train, Chassis(), jax.random.key(1))
     assert tasks.start.shape == (6 + 3 * 4, 2)
     assert (np.abs(np.asarray(tasks.start)) < 64).all()
-    small = ground.test_tasks(CONFIG, plane(0))
+    small = suites.test_tasks(CONFIG, plane(0))
     np.testing.assert_allclose(np.linalg.norm(small.start, axis=-1), 7.5, rtol=1e-5)
 
 

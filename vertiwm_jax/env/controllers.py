@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax.env.driver import Policy
-from vertiwm_jax.env.episode import NavigationConfig
-from vertiwm_jax.env.footprint import Difficulty
+from vertiwm_jax.env.agent import Policy
 from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, GOAL, ROUTE_SCALE, arcs_ahead
+from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.env.traversability import TraversabilityCost
 from vertiwm_jax.state import Command
 
 REFERENCE = "straight to goal"
@@ -57,7 +57,7 @@ class LookAhead:
 
     config: NavigationConfig = struct.field(pytree_node=False)
     speed: float = struct.field(pytree_node=False, default=4.0)
-    difficulty: Difficulty = struct.field(pytree_node=False, default=Difficulty())
+    difficulty: TraversabilityCost = struct.field(pytree_node=False, default=TraversabilityCost())
     reach: float = struct.field(pytree_node=False, default=2.7)
     onward: float = struct.field(pytree_node=False, default=0.15)
     far: tuple[int, int] = struct.field(pytree_node=False, default=(5, 7))
