@@ -1,6 +1,6 @@
 """One script a claim: `python -m benchmarks.NAME [--json]`."""
 
-from vertiwm_jax import devices
+from vertiwm_jax import machine
 
 # Before gymnax is imported, which starts JAX.
-devices.use_cores()
+machine.use_cores()

@@ -14,7 +14,7 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
-from vertiwm_jax import devices
+from vertiwm_jax import machine
 
 Figures = Mapping[str, float | int | str]
 
@@ -60,7 +60,7 @@ def hardware() -> dict[str, str | int]:
     return {
         "cpu": _cpu_model(),
         "cores": os.cpu_count() or 1,
-        "threads": devices.cores(),
+        "threads": machine.cores(),
         "device": f"{device.platform}: {device.device_kind}",
         "jax": jax.__version__,
         "python": platform.python_version(),

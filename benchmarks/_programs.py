@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import jax
 
-from vertiwm_jax import devices
+from vertiwm_jax import machine
 
 Job = tuple[Callable[..., Any], tuple[Any, ...]]
 """A function and its arguments."""
@@ -62,7 +62,7 @@ def compiled(makers: Mapping[Name, Callable[[], Program]]) -> dict[Name, Future[
     a CPU of few cores: they wait for each other for ever.
     """
     futures = {}
-    pool = ThreadPoolExecutor(devices.cores())
+    pool = ThreadPoolExecutor(machine.cores())
     for name, make in makers.items():
         try:
             futures[name] = pool.submit(make().compile)

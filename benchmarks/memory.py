@@ -10,7 +10,7 @@ import jax
 
 from benchmarks._harness import parser, report
 from vertiwm_jax import config as configuration
-from vertiwm_jax import devices, training
+from vertiwm_jax import machine, parallel, training
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
@@ -37,7 +37,7 @@ def main() -> None:
     results = {"imported": {"most_MB": most()}}
     config = configuration.load(PPOTraining, configuration.default_config(chosen.config))
     terrain, pool, _ = task.training_ground(config)
-    devices.forget_programs()
+    machine.forget_programs()
     dynamics, weights = task.dynamics(config, config.model)
     env = NavigationEnv(dynamics, config.asked, config.variation)
     algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
@@ -49,11 +49,11 @@ def main() -> None:
         "terrain_MB": size(params.terrain),
         "starts_MB": size(params.starts),
     }
-    devices.forget_programs()
+    machine.forget_programs()
     state = training.begin(algorithm, params, config.key("training"))
-    iterate, mesh = training.compiled(algorithm, params, batch), devices.mesh(batch)
-    params, state = devices.everywhere(mesh, (params, state))
-    devices.release_memory()
+    iterate, mesh = training.compiled(algorithm, params, batch), parallel.mesh(batch)
+    params, state = parallel.place(mesh, (params, state))
+    machine.release_memory()
     for _ in range(chosen.iterations):
         state, _ = iterate(params, state)
     jax.block_until_ready(state)

@@ -1,6 +1,6 @@
 """Steps of 0.1 s that each model takes in a second, by batch, on mixed ground, patches included.
 
-On as many devices as `vertiwm_jax.devices.mesh` gives a batch: every core of a CPU is one, unless
+On as many devices as `vertiwm_jax.parallel.mesh` gives a batch: every core of a CPU is one, unless
 `JAX_NUM_CPU_DEVICES` sets another number.
 """
 
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks._harness import Figures, measure, parser, report
-from vertiwm_jax import devices
+from vertiwm_jax import parallel
 from vertiwm_jax.dynamics import Params, rollout
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.mechanics.simulator import chrono_like
@@ -73,11 +73,11 @@ def driving(
 def rates(name: ModelName, weights: Path | None, batches: Sequence[int]) -> dict[str, Figures]:
     """Steps a second of one model, by batch."""
     drive, params = driving(name, weights)
-    many = jax.jit(devices.spread(drive, in_axes=(None, None, 0, 0)))
+    many = jax.jit(parallel.vmap(drive, in_axes=(None, None, 0, 0)))
     results = {}
     for batch in batches:
-        mesh = devices.mesh(batch)
-        given = devices.everywhere(mesh, (params, *drives(batch, STEPS)))
+        mesh = parallel.mesh(batch)
+        given = parallel.place(mesh, (params, *drives(batch, STEPS)))
         with jax.set_mesh(mesh):
             figures = measure(many, *given, repeats=3)
         rate = batch * STEPS / figures["median_s"]

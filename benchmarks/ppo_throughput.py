@@ -18,7 +18,7 @@ from gymnax.environments import environment, spaces
 from benchmarks._harness import Figures, measure, parser, report
 from benchmarks.models import PAPER, untrained
 from vertiwm_jax import config as configuration
-from vertiwm_jax import devices
+from vertiwm_jax import parallel
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.ppo import PPOTraining
 from vertiwm_jax.rl import task
@@ -57,8 +57,8 @@ def iteration(ppo: PPO, params: Any, repeat: int = 1) -> Figures:
     algorithm, results = Seeds(ppo, 1), {}
     start = jax.jit(algorithm.init)(params, jax.random.key(0))
     for name, batch in (("", ppo.config.shareable), ("one_device_", 1)):
-        mesh = devices.mesh(batch)
-        whole, state = devices.everywhere(mesh, (params, start))
+        mesh = parallel.mesh(batch)
+        whole, state = parallel.place(mesh, (params, start))
         with jax.set_mesh(mesh):
             figures = measure(jax.jit(algorithm.iterate), whole, state, repeats=3)
         rate = repeat * ppo.config.collected / figures["median_s"]

@@ -41,7 +41,7 @@ def phases(name: str) -> dict[str, dict[str, float]]:
 
     jax.monitoring.register_event_duration_secs_listener(note)
     from vertiwm_jax import config as configuration
-    from vertiwm_jax import devices, training
+    from vertiwm_jax import machine, parallel, training
     from vertiwm_jax.env.navigation import NavigationEnv
     from vertiwm_jax.ppo import PPOTraining
     from vertiwm_jax.rl import task
@@ -51,7 +51,7 @@ def phases(name: str) -> dict[str, dict[str, float]]:
     training.keep_compiled(None)  # in the folder of the environment
     config = configuration.load(PPOTraining, configuration.default_config(name))
     terrain, pool, _ = jax.block_until_ready(task.training_ground(config))
-    devices.forget_programs()
+    machine.forget_programs()
     lap("worlds")
     dynamics, weights = task.dynamics(config, config.model)
     env = NavigationEnv(dynamics, config.asked, config.variation)
@@ -59,11 +59,11 @@ def phases(name: str) -> dict[str, dict[str, float]]:
     training.compiled(algorithm, env.shapes(weights, terrain, pool), batch)
     lap("compile")
     params = jax.block_until_ready(env.make_params(weights, terrain, pool))
-    devices.forget_programs()
+    machine.forget_programs()
     lap("starts")
     state = training.begin(algorithm, params, config.key("training"))
     iterate = training.compiled(algorithm, params, batch)
-    params, state = devices.everywhere(devices.mesh(batch), (params, state))
+    params, state = parallel.place(parallel.mesh(batch), (params, state))
     lap("weights")
     jax.block_until_ready(iterate(params, state))
     lap(_LAST)

@@ -12,7 +12,7 @@ import torch
 from benchmarks._harness import Figures, measure, parser, report
 from benchmarks.peers.torch_query import Ground, tensor
 from benchmarks.peers.torch_vertiwm import TorchVertiWM
-from vertiwm_jax import devices
+from vertiwm_jax import machine, parallel
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.mechanics.vehicle import hmmwv
@@ -86,11 +86,11 @@ def ours(model: VertiWM, params: VertiWMParams) -> Callable[[Drives], Roll]:
         history = model.init(params, ground, start)
         return rollout(model, params, ground, history, start, commands).vector
 
-    many = jax.jit(devices.spread(drive, in_axes=(None, None, 0, 0, 0)))
+    many = jax.jit(parallel.vmap(drive, in_axes=(None, None, 0, 0, 0)))
 
     def holding(drives: Drives) -> Roll:
-        mesh = devices.mesh(len(drives.worlds))
-        held = devices.everywhere(mesh, (params, *drives))
+        mesh = parallel.mesh(len(drives.worlds))
+        held = parallel.place(mesh, (params, *drives))
 
         def roll() -> jax.Array:
             with jax.set_mesh(mesh):
@@ -184,7 +184,7 @@ def main() -> None:
     arguments.add_argument("--batches", nargs="+", type=int, default=BATCHES)
     arguments.add_argument("--repeats", type=int, default=10, help="timed rollouts, at least")
     chosen = arguments.parse_args()
-    torch.set_num_threads(devices.cores())
+    torch.set_num_threads(machine.cores())
     results: dict[str, Figures] = {}
     for batch in chosen.batches:
         results |= rates(chosen.ways, batch, chosen.repeats)

@@ -6,7 +6,7 @@ import sys
 import pytest
 from doors import opened, refusal
 
-from vertiwm_jax import compare, devices, runs
+from vertiwm_jax import compare, machine, runs
 from vertiwm_jax import config as configuration
 from vertiwm_jax.compare import CompareConfig, Row
 
@@ -40,8 +40,8 @@ def test_policies_are_trained_once_and_judged_together(tmp_path, monkeypatch):
         # Stopped before its test: it is not trained again, but tested.
         (nesam,) = run.glob("ppo_in_nesam/ppo-*")
         before, kept = runs.read_metrics(nesam), (nesam / "config.yaml").read_text()
-        faster = devices.multiplies_bfloat16()
-        monkeypatch.setattr(devices, "multiplies_bfloat16", lambda: not faster)
+        faster = machine.multiplies_bfloat16()
+        monkeypatch.setattr(machine, "multiplies_bfloat16", lambda: not faster)
         (nesam / "summary.json").unlink()
         shutil.rmtree(run / "builtin")
         table("--resume", str(run))

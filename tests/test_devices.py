@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rl.probes import ProbeParams, Staggered, Target
 
-from vertiwm_jax import devices
+from vertiwm_jax import machine, parallel
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.dataset import Auxiliary
 from vertiwm_jax.learning.fitting import Fit, FitConfig, FitInputs
@@ -31,17 +31,17 @@ OPEN = Path(__file__).parents[1] / "data" / "open"
 def devices_of(mesh, function, *args):
     """What a compiled function gives, with batches shared out on the mesh."""
     with jax.set_mesh(mesh):
-        return jax.jit(function)(*devices.everywhere(mesh, args))
+        return jax.jit(function)(*parallel.place(mesh, args))
 
 
 @pytest.fixture
 def two():
-    return devices.mesh(16)
+    return parallel.mesh(16)
 
 
 def test_a_mesh_has_as_many_devices_as_divide_the_batch(two):
     assert jax.device_count() == 2 == two.size
-    assert devices.mesh(17).size == devices.mesh(4).size == devices.mesh(1).size == 1
+    assert parallel.mesh(17).size == parallel.mesh(4).size == parallel.mesh(1).size == 1
 
 
 @pytest.mark.parametrize(("size", "at_a_time"), [(16, None), (16, 3), (7, None), (7, 2), (1, 5)])
@@ -51,7 +51,7 @@ def test_a_spread_function_gives_what_vmap_gives(two, size, at_a_time):
 
     x, y = jax.random.normal(jax.random.key(0), (size, 3)), jnp.arange(size)
     expected = jax.vmap(function, (None, 0, 0))(2.0, x, y)
-    spread = devices.spread(function, (None, 0, 0), at_a_time)
+    spread = parallel.vmap(function, (None, 0, 0), at_a_time)
     chex.assert_trees_all_close(spread(2.0, x, y), expected, rtol=1e-6)
     chex.assert_trees_all_close(devices_of(two, spread, 2.0, x, y), expected, rtol=1e-6)
 
@@ -63,33 +63,33 @@ def test_arrays_without_elements_are_spread_too(two):
         return x + all_.shape[0] + each.shape[0] + all_.sum() + each.sum()
 
     args = jnp.zeros((3, 0)), jnp.zeros((8, 2, 0), jnp.int32), jnp.arange(8.0)
-    given = devices_of(two, devices.spread(function, (None, 0, 0)), *args)
+    given = devices_of(two, parallel.vmap(function, (None, 0, 0)), *args)
     chex.assert_trees_all_close(given, jnp.arange(8.0) + 5)
 
 
 @pytest.mark.parametrize(("half", "faster"), [(0.55, True), (0.9, False), (1.6, False)])
 def test_bfloat16_has_to_be_clearly_faster(half, faster, monkeypatch):
-    monkeypatch.setattr(devices, "_seconds_of_matmul", lambda *_: [1.0, half])
-    assert devices.multiplies_bfloat16.__wrapped__() is faster
+    monkeypatch.setattr(machine, "_seconds_of_matmul", lambda *_: [1.0, half])
+    assert machine.multiplies_bfloat16.__wrapped__() is faster
 
 
 def test_each_device_has_its_share_of_the_rows(two):
     with jax.set_mesh(two):
-        program = jax.jit(devices.spread(jnp.sin, (0,), 4)).lower(jnp.zeros(64))
+        program = jax.jit(parallel.vmap(jnp.sin, (0,), 4)).lower(jnp.zeros(64))
     # 32 rows on each device, in eight turns of four.
     assert "tensor<8x4xf32>" in program.as_text()
 
 
 def test_what_is_shared_out_already_is_not_shared_out_again(two):
-    inner = devices.spread(jnp.sin, (0,))
+    inner = parallel.vmap(jnp.sin, (0,))
     x = jax.random.normal(jax.random.key(0), (8, 3))
-    given = devices_of(two, devices.spread(inner, (0,)), x)
+    given = devices_of(two, parallel.vmap(inner, (0,)), x)
     chex.assert_trees_all_close(given, jnp.sin(x), rtol=1e-6)
 
 
 def test_gradients_are_summed_over_devices(two):
     def loss(weight, x):
-        return jnp.mean(devices.spread(lambda weight, x: (weight @ x) ** 2, (None, 0))(weight, x))
+        return jnp.mean(parallel.vmap(lambda weight, x: (weight @ x) ** 2, (None, 0))(weight, x))
 
     weight, x = jnp.arange(3.0), jax.random.normal(jax.random.key(0), (12, 3))
     expected = jax.grad(lambda w: jnp.mean((x @ w) ** 2))(weight)
@@ -97,7 +97,7 @@ def test_gradients_are_summed_over_devices(two):
 
 
 def test_results_of_what_is_shared_out_are_on_one_device():
-    doubled = devices.shared_out(jax.jit(devices.spread(lambda x: 2 * x, (0,))), 16)
+    doubled = parallel.shared_out(jax.jit(parallel.vmap(lambda x: 2 * x, (0,))), 16)
     result = doubled(jnp.arange(16))
     assert result.devices() == {jax.devices()[0]} and jax.typeof(result).sharding.mesh.empty
     np.testing.assert_array_equal(result, 2 * np.arange(16))
@@ -113,7 +113,7 @@ def test_turns_give_what_all_at_once_gives(at_a_time):
         return {"sum": batch["a"] + batch["b"][:, 0], "first": batch["b"][:, :1]}
 
     batch = {"a": jnp.arange(10), "b": jnp.arange(20).reshape(10, 2)}
-    found = devices.in_turns(function, batch, at_a_time)
+    found = parallel.in_turns(function, batch, at_a_time)
     assert traced == [at_a_time]
     chex.assert_trees_all_equal(found, function(batch))
 
@@ -131,7 +131,7 @@ def with_three_cores(program: str) -> subprocess.CompletedProcess[str]:
     [
         ("sys.argv[0] = '-m'", 3),  # as while Python looks for a command
         ("sys.argv[0] = 'script.py'", 1),
-        ("from vertiwm_jax import devices; devices.use_cores(); devices.use_cores()", 3),
+        ("from vertiwm_jax import machine, parallel; machine.use_cores(); machine.use_cores()", 3),
     ],
 )
 def test_commands_use_all_cores_and_scripts_what_they_ask_for(before, expected):
@@ -140,7 +140,7 @@ def test_commands_use_all_cores_and_scripts_what_they_ask_for(before, expected):
 
 
 def test_to_ask_for_all_cores_too_late_is_an_error_that_says_what_to_do():
-    program = "import vertiwm_jax.ppo\nfrom vertiwm_jax import devices\ndevices.use_cores()\n"
+    program = "import vertiwm_jax.ppo\nfrom vertiwm_jax import machine\nmachine.use_cores()\n"
     found = with_three_cores(program)
     assert found.returncode == 1
     assert "JAX has started with 1 CPU device(s) of 3. Call it before" in found.stderr
@@ -174,7 +174,7 @@ def test_training_on_two_devices_is_training_on_one(two, name, seeds):
             state, metrics = devices_of(mesh, algorithm.iterate, params, state)
         return jax.device_get((jax.tree.map(random_bits, state), metrics))
 
-    chex.assert_trees_all_close(train(two), train(devices.mesh(1)), rtol=2e-4, atol=2e-5)
+    chex.assert_trees_all_close(train(two), train(parallel.mesh(1)), rtol=2e-4, atol=2e-5)
 
 
 def random_bits(leaf):
@@ -197,4 +197,4 @@ def test_fitting_on_two_devices_is_fitting_on_one(two):
         state, metrics = devices_of(mesh, fit.iterate, inputs, start)
         return jax.device_get((state.trained, state.best_error, metrics))
 
-    chex.assert_trees_all_close(fitted(two), fitted(devices.mesh(1)), rtol=1e-4)
+    chex.assert_trees_all_close(fitted(two), fitted(parallel.mesh(1)), rtol=1e-4)

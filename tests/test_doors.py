@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from doors import opened, refusal
 
-from vertiwm_jax import checkpoints, devices, evaluate, export, policy_training, ppo, runs, sac, td3
+from vertiwm_jax import checkpoints, evaluate, export, machine, policy_training, ppo, runs, sac, td3
 from vertiwm_jax import config as configuration
 from vertiwm_jax.deploy import run_policy
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
@@ -304,7 +304,7 @@ def test_a_policy_drives_another_vehicle(run, tmp_path, capsys):
 def test_training_inside_a_world_model_and_judged_in_the_simulator(
     train, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(devices, "multiplies_bfloat16", lambda: True)
+    monkeypatch.setattr(machine, "multiplies_bfloat16", lambda: True)
     config = ModelConfig()
     params = config.init_params(jax.random.key(0), choose("builtin")[1])
     model.save(tmp_path / "model", config, params)

@@ -3,7 +3,7 @@
 import gc
 import sys
 
-from vertiwm_jax import devices, hosts
+from vertiwm_jax import hosts, machine
 
 __version__ = "0.1.0"
 
@@ -11,7 +11,7 @@ __version__ = "0.1.0"
 # will run, and it is to use all cores, on all hosts. Later is too late, for to import gymnax starts
 # JAX.
 if sys.argv[:1] == ["-m"]:
-    devices.use_cores()
+    machine.use_cores()
     # Tracing makes many objects that stay: to look for garbage among them is a sixth of its time.
     gc.set_threshold(100_000, 50, 50)
     hosts.join(hosts.command())

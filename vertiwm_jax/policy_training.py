@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal, Protocol
 import jax
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import devices, runs
+from vertiwm_jax import machine, runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.action_repeat import ActionRepeat, Controller
@@ -151,7 +151,7 @@ def train_and_report(config: TrainConfig) -> Path:
     print("drawing worlds ...", flush=True)
     with _on_usable_ground():
         terrain, pool, held_out = task.training_ground(config)
-        devices.forget_programs()
+        machine.forget_programs()
         dynamics, weights = task.dynamics(config, config.model)
         env = NavigationEnv(dynamics, config.asked, config.variation)
         shapes = env.shapes(weights, terrain, pool)
@@ -164,7 +164,7 @@ def train_and_report(config: TrainConfig) -> Path:
     print(f"placing vehicles for {len(pool.world):,} tasks ...", flush=True)
     with _on_usable_ground():
         params = env.make_params(weights, terrain, pool)
-    devices.forget_programs()
+    machine.forget_programs()
     with Run.begin(config, config.name, restored[0] if restored else 0, config.wandb) as run:
         print(f"run folder {run.folder}", flush=True)
         products = "" if config.model == "builtin" else f", multiplying {config.operands}"
@@ -184,7 +184,7 @@ def train_and_report(config: TrainConfig) -> Path:
         policies = _policies(config, algorithm, params, state) | baselines(config.asked)
         _draw_learning(run, config)
         del params, state  # Tests need the memory.
-        devices.forget_programs()
+        machine.forget_programs()
         with _on_usable_ground():
             test = task.test_environment(config, held_out)
         groups = report.drive(test.env, test.params, policies, config.key("testing"))

@@ -18,7 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
-from vertiwm_jax import checkpoints, devices, hosts, xla
+from vertiwm_jax import checkpoints, hosts, machine, parallel, xla
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import Count, settings
 from vertiwm_jax.errors import UserError
@@ -147,7 +147,7 @@ def compiled(algorithm: Algorithm[State], data: Any, batch: int) -> Any:
     kinds = jax.eval_shape(lambda x: (x, algorithm.init(x, jax.random.key(0))), data)
     leaves, kind = jax.tree.flatten(kinds)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-    return _compiled(algorithm, devices.mesh(batch), kind, shapes)
+    return _compiled(algorithm, parallel.mesh(batch), kind, shapes)
 
 
 def begin(algorithm: Algorithm[State], data: Any, key: jax.Array) -> State:
@@ -182,8 +182,9 @@ def train(
 
     iterate = compiled(algorithm, data, work.batch)
     # Between iterations every device has all, so that checkpoints do not know of devices.
-    data, state = devices.everywhere(devices.mesh(work.batch), (data, state))
-    devices.release_memory()
+    mesh = parallel.mesh(work.batch)
+    data, state = parallel.place(mesh, (data, state))
+    machine.release_memory()
     total = (iterations - done) * work.amount
     with _interruptible() as interrupted, run.progress(total, "training") as progress:
         while done < iterations and not hosts.on_any(bool(interrupted)):
@@ -210,19 +211,19 @@ def train(
             f"stopped after iteration {done} of {iterations}, all saved; "
             f"go on with --resume {run.outermost}"
         )
-    return devices.in_one_place(state)
+    return parallel.gather(mesh, state)
 
 
 @functools.lru_cache(maxsize=1)
 def _compiled(algorithm: Algorithm[Any], mesh: Mesh, kind: Any, shapes: tuple[Any, ...]) -> Any:
     """For data and state of a kind of pytree with leaves of these shapes and types."""
     print(f"compiling for {mesh.size} of {jax.device_count()} devices ...", flush=True)
-    start, place = time.perf_counter(), devices.on_all(mesh)
+    start, place = time.perf_counter(), parallel.everywhere(mesh)
     leaves = [jax.ShapeDtypeStruct(*shape, sharding=place) for shape in shapes]
     iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=place)
     with jax.set_mesh(mesh):
         done = iterate.lower(*jax.tree.unflatten(kind, leaves)).compile()
-    devices.release_memory()
+    machine.release_memory()
     print(f"compiled in {time.perf_counter() - start:.0f} s", flush=True)
     return done
 

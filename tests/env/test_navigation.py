@@ -9,7 +9,7 @@ import pytest
 from env.worlds import BICYCLE, Scripted, bicycle_env, ground, hills, step_of_many, task
 from flax import struct
 
-from vertiwm_jax import devices
+from vertiwm_jax import parallel
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
@@ -233,14 +233,14 @@ def test_a_model_is_traced_once_for_starts_and_for_steps(name, monkeypatch):
     pool = circle_tasks(terrain, 55.0, 4)
     env, number = NavigationEnv(model), len(pool.world)
     shapes = env.shapes(params, terrain, pool)
-    mesh = devices.mesh(number)
+    mesh = parallel.mesh(number)
     keys, actions = jax.random.split(KEY, number), jnp.zeros((number, 2))
     given = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=devices.on_all(mesh)),
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=parallel.everywhere(mesh)),
         (keys, shapes.starts, actions, shapes),
     )
     with jax.set_mesh(mesh):
-        jax.eval_shape(devices.spread(env.step, (0, 0, 0, None)), *given)
+        jax.eval_shape(parallel.vmap(env.step, (0, 0, 0, None)), *given)
     assert len(traced) == 1
 
 

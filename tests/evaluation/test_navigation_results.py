@@ -9,7 +9,7 @@ from env.worlds import bicycle_env, ground, hills
 from flax import struct
 from scipy.stats import binomtest
 
-from vertiwm_jax import devices
+from vertiwm_jax import parallel
 from vertiwm_jax.env.agent import Agent
 from vertiwm_jax.env.controllers import RandomActions, StraightToGoal
 from vertiwm_jax.env.task import NavigationConfig
@@ -90,7 +90,7 @@ def test_decides_for_each_that_drives_as_if_it_were_alone(short, together, monke
     jax.effects_barrier()
     assert len(set(found.steps.tolist())) > 2  # Some drive on where others have ended.
     # Nothing is decided where all that decide together have ended.
-    turn = min(together * devices.mesh(params.pool_size).size, params.pool_size)
+    turn = min(together * parallel.mesh(params.pool_size).size, params.pool_size)
     driving = [sum(found.steps > time) for time in range(0, max(found.steps), interval)]
     assert len(decided) == sum(-(-number // turn) * turn for number in driving)
     step, length = jax.jit(env.step_env), int(params.max_steps_in_episode)

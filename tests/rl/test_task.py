@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vertiwm_jax import config, devices
+from vertiwm_jax import config, machine
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.suites import GroundConfig
@@ -52,7 +52,7 @@ def test_a_rover_is_tested_on_soil_of_its_scale():
     ],
 )
 def test_models_multiply_what_is_asked_or_faster(asked, faster, found, monkeypatch):
-    monkeypatch.setattr(devices, "multiplies_bfloat16", lambda: faster)
+    monkeypatch.setattr(machine, "multiplies_bfloat16", lambda: faster)
     chosen = TaskConfig(operands=asked)
     assert chosen.multiplied == found
     _, params = task.dynamics(chosen, "nesam")

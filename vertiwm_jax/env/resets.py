@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax import devices, xla
+from vertiwm_jax import parallel, xla
 from vertiwm_jax.dynamics import Dynamics, History, Params, step
 from vertiwm_jax.env import route, tasks
 from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
@@ -42,8 +42,8 @@ class ResetPool:
         else:
             routes = route.plan(config.route, terrain, config.chassis, pool.world, pool.goal)
         together, numbered = _in_turns(pool)
-        settle = devices.shared_out(partial(_settle_once, self), together)
-        states, seen = devices.in_turns(
+        settle = parallel.shared_out(partial(_settle_once, self), together)
+        states, seen = parallel.in_turns(
             lambda some: settle(weights, terrain, routes, *some), numbered, together
         )
         finite = np.all(np.isfinite(states.vehicle.vector), axis=-1)
@@ -64,7 +64,7 @@ class ResetPool:
         together, numbered = _in_turns(pool)
         some = jax.tree.map(lambda x: x[:together], numbered)
         # As they will settle, so that it is traced only once.
-        shapes = devices.shapes(partial(_settle, self), together)
+        shapes = parallel.shapes(partial(_settle, self), together)
         states, seen = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct((len(pool.world), *x.shape[1:]), x.dtype),
             shapes(weights, terrain, routes, *some),
@@ -149,14 +149,14 @@ def _settle(
         believed = dataclasses.replace(selected, belief=state.belief)
         return state, see(config, believed, routes.select(number), state)
 
-    placed = devices.spread(place, (None, None, 0))(dynamics, terrain, pool)
+    placed = parallel.vmap(place, (None, None, 0))(dynamics, terrain, pool)
     # Steps of all, and not all steps of each: inside of `vmap`, a scan is traced again until it is
     # known what of a history differs between vehicles.
-    stand_all = partial(devices.spread(stand, (None, None, 0, 0)), dynamics, terrain, pool.world)
+    stand_all = partial(parallel.vmap(stand, (None, None, 0, 0)), dynamics, terrain, pool.world)
     settled, _ = jax.lax.scan(
         lambda placed, _: (stand_all(placed), None), placed, length=config.settle_steps
     )
-    start_all = devices.spread(start, (None, None, 0, 0, 0))
+    start_all = parallel.vmap(start, (None, None, 0, 0, 0))
     return start_all(terrain, routes, pool, numbers, settled)
 
 

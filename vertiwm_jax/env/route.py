@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax import devices
+from vertiwm_jax import parallel
 from vertiwm_jax.config import Bounds, NotNegative, settings
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.termination import edge_distance
@@ -86,9 +86,9 @@ def plan(
     config: RouteConfig, terrain: TerrainMap, chassis: Chassis, world: jax.Array, goal: jax.Array
 ) -> Routes:
     """Routes to goals `[P, 2]`, m, in worlds `[P]`; all devices work at them."""
-    of_worlds = devices.shared_out(functools.partial(_all_costs, config, chassis), terrain.worlds)
+    of_worlds = parallel.shared_out(functools.partial(_all_costs, config, chassis), terrain.worlds)
     costs = of_worlds(terrain, jnp.arange(terrain.worlds))
-    to_goals = devices.shared_out(_all_costs_to_go, len(world))
+    to_goals = parallel.shared_out(_all_costs_to_go, len(world))
     return Routes(to_goals(terrain, costs, world, goal), jnp.int32(0))
 
 
@@ -110,7 +110,7 @@ def _all_costs(
     config: RouteConfig, chassis: Chassis, terrain: TerrainMap, world: jax.Array
 ) -> jax.Array:
     """`[W, 16, n, n]`"""
-    each = devices.spread(functools.partial(_costs, config, chassis), (None, 0), _TOGETHER)
+    each = parallel.vmap(functools.partial(_costs, config, chassis), (None, 0), _TOGETHER)
     return each(terrain, world)
 
 
@@ -119,7 +119,7 @@ def _all_costs_to_go(
     terrain: TerrainMap, costs: jax.Array, world: jax.Array, goal: jax.Array
 ) -> jax.Array:
     """`[P, n, n]`"""
-    each = devices.spread(_costs_to_go, (None, None, 0, 0), _TOGETHER)
+    each = parallel.vmap(_costs_to_go, (None, None, 0, 0), _TOGETHER)
     return each(terrain, costs, world, goal)
 
 

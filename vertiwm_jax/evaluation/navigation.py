@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax import devices
+from vertiwm_jax import parallel
 from vertiwm_jax.env.agent import Agent, Policy, Reactive
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import TaskParams, TaskState
@@ -70,7 +70,7 @@ def evaluate(
     """
     driver = policy if isinstance(policy, Agent) else Reactive(policy)
     program = partial(_evaluate, env, int(params.max_steps_in_episode))
-    return devices.shared_out(program, params.pool_size)(params, driver, key)
+    return parallel.shared_out(program, params.pool_size)(params, driver, key)
 
 
 @partial(jax.jit, static_argnames=("env", "length"))
@@ -78,7 +78,7 @@ def _evaluate(
     env: NavigationEnv, length: int, params: TaskParams, driver: Agent, key: jax.Array
 ) -> NavigationResult:
     count = params.pool_size
-    observation, start = devices.spread(env.start, (None, 0))(params, jnp.arange(count))
+    observation, start = parallel.vmap(env.start, (None, 0))(params, jnp.arange(count))
 
     def position_and_rpy(state: TaskState) -> tuple[jax.Array, jax.Array]:
         return state.vehicle.position, state.vehicle.rpy
@@ -87,7 +87,7 @@ def _evaluate(
         lambda x: jnp.broadcast_to(x, (length + 1, *x.shape)), position_and_rpy(start)
     )
 
-    @partial(devices.spread, in_axes=(None, None, 0, 0, 0, 0))
+    @partial(parallel.vmap, in_axes=(None, None, 0, 0, 0, 0))
     def drive(
         driver: Agent,
         params: TaskParams,
@@ -122,7 +122,7 @@ def _evaluate(
 
     # Steps after the time limit, to fill an interval, change nothing: all episodes are over.
     deciding = jax.random.fold_in(key, length)
-    memory = devices.spread(type(driver).start, (None, None, 0))(driver, params, start)
+    memory = parallel.vmap(type(driver).start, (None, None, 0))(driver, params, start)
     carry = jnp.int32(0), memory, observation, start, paths
     # Not a `while_loop`: on CPUs XLA runs what is inside one several times slower.
     decisions = -(-length // driver.interval)
@@ -163,12 +163,12 @@ def _decide(
     none are imagined once a task is over.
     """
     running = state.ending == TerminationReason.RUNNING
-    together = min(_TOGETHER * devices.number(), len(running))
+    together = min(_TOGETHER * parallel.number(), len(running))
     turns = -(-len(running) // together)
     # Those that drive come first, and the last turn is filled up with one that likely does not.
     filled = np.minimum(np.arange(turns * together), len(running) - 1)
     rows = jnp.argsort(~running)[filled].reshape(turns, together)
-    decide = devices.spread(type(driver).decide, (None, None, 0, 0, 0, 0))
+    decide = parallel.vmap(type(driver).decide, (None, None, 0, 0, 0, 0))
 
     def turn(rows: jax.Array) -> Any:
         of_some = jax.tree.map(lambda x: x[rows], (memory, observation, state, keys))

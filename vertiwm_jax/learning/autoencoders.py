@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax import devices
+from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, NotNegative, settings
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning.dataset import Drives
@@ -104,7 +104,7 @@ class AutoencoderProblem:
             return elevation + jnp.mean((again.rgb - seen.rgb) ** 2)
 
         places = near(data, key, self.config)
-        return jnp.mean(devices.spread(one, (None, None, 0))(params, data.terrain, places))
+        return jnp.mean(parallel.vmap(one, (None, None, 0))(params, data.terrain, places))
 
     def validate(self, params: Params, data: PatchData) -> dict[str, jax.Array]:
         """Errors of reconstruction at recorded poses; `error` is the loss there.
@@ -127,7 +127,7 @@ class AutoencoderProblem:
             same = nearest(terrain, again.rgb) == nearest(terrain, seen.rgb)
             return elevation, colour, jnp.mean(same)
 
-        means = devices.spread(one, (None, None, 0), config.batch)(params, terrain, data.validation)
+        means = parallel.vmap(one, (None, None, 0), config.batch)(params, terrain, data.validation)
         elevation, colour, accuracy = map(jnp.mean, means)
         return {
             "elevation_rms": RELIEF_METRES * jnp.sqrt(elevation),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax import devices
+from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, CountOrZero, NotNegative, settings
 from vertiwm_jax.dynamics import Dynamics, History, Params, warm_up
 from vertiwm_jax.learning import augment, windows
@@ -167,7 +167,7 @@ class WindowProblem:
         def one(params: Params, terrain: TerrainMap, window: Windows) -> jax.Array:
             return self.objective(params, terrain.select(window.world), window)
 
-        return jnp.mean(devices.spread(one, (None, None, 0))(params, data.terrain, batch))
+        return jnp.mean(parallel.vmap(one, (None, None, 0))(params, data.terrain, batch))
 
     def validate(self, params: Params, data: WindowData) -> dict[str, jax.Array]:
         """Position errors, m; a prediction that is not finite counts as not having moved."""
@@ -182,7 +182,7 @@ class WindowProblem:
             lost = ~jnp.isfinite(error)
             return jnp.where(lost, jnp.linalg.norm(start - truth), error), lost
 
-        all_of_them = devices.spread(one, (None, None, 0), self.config.batch)
+        all_of_them = parallel.vmap(one, (None, None, 0), self.config.batch)
         error, lost = all_of_them(params, data.validation_terrain, data.validation)
         kinds = data.validation.ground == jnp.arange(len(GROUNDS))[:, None]
         means = jnp.sum(kinds * error, axis=1) / jnp.sum(kinds, axis=1)

@@ -6,7 +6,7 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax import devices
+from vertiwm_jax import parallel
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning.autoencoders import AutoencoderConfig, PatchData, Places, near
 from vertiwm_jax.networks import soil_predictor
@@ -37,13 +37,13 @@ class SoilProblem:
     def loss(self, params: Params, data: PatchData, key: jax.Array) -> jax.Array:
         """Mean squared error `[]` of the six parameters, each as its share of `BOUNDS`."""
         places = near(data, key, self.config)
-        errors = devices.spread(self._error, (None, None, 0))
+        errors = parallel.vmap(self._error, (None, None, 0))
         error, counts = errors(params, data.terrain, places)
         return jnp.sum(jnp.mean(error**2, axis=-1)) / jnp.maximum(jnp.sum(counts), 1.0)
 
     def validate(self, params: Params, data: PatchData) -> dict[str, jax.Array]:
         """Root mean square errors at recorded places on soil, as shares of `BOUNDS`."""
-        errors = devices.spread(self._error, (None, None, 0), self.config.batch)
+        errors = parallel.vmap(self._error, (None, None, 0), self.config.batch)
         error, counts = errors(params, data.validation_terrain, data.validation)
         square = jnp.sum(error**2, axis=0) / jnp.maximum(jnp.sum(counts), 1.0)
         each = {f"error_{name}": jnp.sqrt(x) for name, x in zip(BOUNDS, square, strict=True)}

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 from gymnax.environments.environment import Environment
 
-from vertiwm_jax import devices
+from vertiwm_jax import parallel
 
 Metrics = dict[str, jax.Array]
 Outcomes = Callable[[dict[str, jax.Array]], Metrics]
@@ -62,7 +62,7 @@ class Experience:
 def start(env: Environment, env_params: Any, number: int, key: jax.Array) -> Environments:
     """The beginning of `number` episodes."""
     keys = jax.random.split(key, number)
-    observation, state = devices.spread(env.reset, (0, None))(keys, env_params)
+    observation, state = parallel.vmap(env.reset, (0, None))(keys, env_params)
     zeros = jnp.zeros(number)
     return Environments(state, observation, zeros, zeros, zeros)
 
@@ -85,7 +85,7 @@ def step(
     low, high = jnp.asarray(space.low), jnp.asarray(space.high)
     bounded = low + (high - low) * (jnp.clip(action, -1, 1) + 1) / 2
     keys = jax.random.split(key, len(action))
-    step_all = devices.spread(env.step, (0, 0, 0, None))
+    step_all = parallel.vmap(env.step, (0, 0, 0, None))
     observation, state, reward, terminated, truncated, info = step_all(
         keys, environments.state, bounded, env_params
     )

@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar
 
 import jax
 
-from vertiwm_jax import devices, training
+from vertiwm_jax import parallel, training
 from vertiwm_jax.config import Count, settings
 from vertiwm_jax.runs import Run
 from vertiwm_jax.training import Algorithm, CheckpointConfig, Work
@@ -41,7 +41,7 @@ class Seeds(Generic[State]):
             alone = jax.tree.map(lambda x: x[0], state)
             return jax.tree.map(lambda x: x[None], self.algorithm.iterate(env_params, alone))
         # As many seeds on every device, or else a share of the environments of all of them.
-        each = devices.spread if self.seeds % devices.number() == 0 else jax.vmap
+        each = parallel.vmap if self.seeds % parallel.number() == 0 else jax.vmap
         return each(self.algorithm.iterate, (None, 0))(env_params, state)
 
 

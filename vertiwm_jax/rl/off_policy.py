@@ -14,7 +14,7 @@ import optax
 from flax import struct
 from gymnax.environments.environment import Environment
 
-from vertiwm_jax import devices
+from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, NotNegative, Share, settings
 from vertiwm_jax.networks.policy import ActionCritic, Senses, SquashedActor, twin_values
 from vertiwm_jax.rl import environments
@@ -315,7 +315,7 @@ class OffPolicy(Generic[Learner]):
             observations = observations.update(experience.observation)
         return replace(
             state,
-            replay=state.replay.add(devices.whole(rows)),
+            replay=state.replay.add(parallel.whole(rows)),
             returns=returns,
             observations=observations,
             environments=running,
@@ -329,7 +329,7 @@ class OffPolicy(Generic[Learner]):
 
         def update(learner: Learner, key: jax.Array) -> tuple[Learner, Metrics]:
             sample_key, learn_key = jax.random.split(key)
-            batch = devices.share(state.replay.sample(sample_key, self.config.batch))
+            batch = parallel.share(state.replay.sample(sample_key, self.config.batch))
             batch = replace(
                 batch,
                 observation=state.observations.normalise(batch.observation),

@@ -16,7 +16,7 @@ import optax
 from flax import struct
 from gymnax.environments.environment import Environment
 
-from vertiwm_jax import devices
+from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, NotNegative, Positive, Share, settings
 from vertiwm_jax.networks.policy import Actor, Critic, Gaussian, Senses
 from vertiwm_jax.rl import environments
@@ -261,7 +261,9 @@ class PPO:
 
         value_of = replace(self.value(env_params, state), scale=jnp.float32(1))
         # They are few; all others are valued one step later. Devices need not wait for each other.
-        value_of_last = devices.split(if_any_truncated, (None, 0, 0))
+        value_of_last = parallel.shard(
+            if_any_truncated, (parallel.WHOLE, parallel.ROWS, parallel.ROWS), parallel.ROWS
+        )
         keys = jax.random.split(key, self.config.num_steps)
         running, transitions = jax.lax.scan(advance, state.environments, keys)
         following = value_of(running.observation)
@@ -312,7 +314,7 @@ class PPO:
                 return x[*jnp.divmod(row, leaf.shape[2]), *numbers]
 
             found = jax.vmap(of_group, in_axes=(1, 0))(leaf, rows)
-            return devices.share(found.reshape(-1, *found.shape[2:]))
+            return parallel.share(found.reshape(-1, *found.shape[2:]))
 
         def seen(rows: jax.Array) -> jax.Array:
             """Chosen observations, normalised."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 import jax
 
-from vertiwm_jax import devices
+from vertiwm_jax import machine
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import suites, tasks
 from vertiwm_jax.env.chassis import Chassis
@@ -66,7 +66,7 @@ class TaskConfig:
     def multiplied(self) -> Operands:
         """`operands`, or which of them are faster here."""
         if self.operands == "auto":
-            return "bfloat16" if devices.multiplies_bfloat16() else "float32"
+            return "bfloat16" if machine.multiplies_bfloat16() else "float32"
         return self.operands
 
     @property

@@ -1,0 +1,220 @@
+"""Batches shared out to several devices: accelerators, or the cores of a CPU.
+
+A mesh in context (`jax.set_mesh(parallel.mesh(...))`) says to which. Without one, and inside of
+what is shared out already, everything is computed in one place.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, TypeVar, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from vertiwm_jax import hosts, machine
+
+T = TypeVar("T")
+
+AXIS = "devices"
+"""The axis of the mesh."""
+WHOLE, ROWS = PartitionSpec(), PartitionSpec(AXIS)
+"""Of arrays that every device has whole, and of those whose rows devices share."""
+FEWEST = 4
+"""Rows of a batch that are worth a device of their own."""
+
+
+def mesh(batch: int) -> Mesh:
+    """The devices for batches of this size: as many as divide it and have `FEWEST` rows or more.
+
+    They are equally many of each host; where that cannot be, every host does all with its own.
+    """
+    most, each = max(1, batch // FEWEST), jax.local_device_count()
+    of_all = sorted(jax.devices(), key=lambda device: device.process_index)
+    together, alone = np.reshape(of_all, (-1, each)), np.reshape(jax.local_devices(), (1, each))
+    even = next(
+        by_host[:, :number]
+        for by_host in (together, alone)
+        for number in range(each, 0, -1)
+        if len(by_host) * number <= most and batch % (len(by_host) * number) == 0
+    )
+    return Mesh(even.ravel(), (AXIS,), axis_types=(AxisType.Auto,))
+
+
+def number() -> int:
+    """Devices to share out to, here."""
+    around = jax.sharding.get_abstract_mesh()
+    return around.shape[AXIS] if AXIS in around.auto_axes else 1
+
+
+def place(mesh: Mesh, tree: T) -> T:
+    """A pytree of arrays, of which every device has a copy; of several hosts, the first one's."""
+    places = everywhere(mesh)
+    if not mesh.is_multi_process:
+        if mesh.devices.flat[0].platform == "cpu":
+            # All cores read one copy: JAX takes arrays of NumPy as they lie in memory.
+            tree = hosts.with_keys(tree, jax.tree.map(np.asarray, hosts.without_keys(tree)))
+        return jax.device_put(tree, places)
+    sent = hosts.of_first(hosts.without_keys(tree))
+    placed = jax.tree.map(partial(jax.make_array_from_process_local_data, places), sent)
+    return hosts.with_keys(tree, placed)
+
+
+def everywhere(mesh: Mesh) -> NamedSharding:
+    """The place of what every device has a copy of."""
+    return NamedSharding(mesh, WHOLE)
+
+
+def gather(mesh: Mesh, tree: T) -> T:
+    """Whole arrays on this host's first device; their types know of no mesh."""
+    put = jax.device_put(tree, everywhere(mesh)) if mesh.is_multi_process else place(mesh, tree)
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), put)
+
+
+def shard(function: Callable[..., T], in_specs: Sequence[Any], out_specs: Any) -> Callable[..., T]:
+    """`jax.shard_map` on the mesh in context; without one, the function as it is.
+
+    in_specs: how the leaves of each argument are shared out, or trees of that. All arrays must be
+        arguments: what a function closes over is not on the device.
+    """
+    if number() == 1:
+        return function
+    mesh, in_specs = jax.sharding.get_abstract_mesh(), tuple(in_specs)
+
+    def on_mesh(*args: Any) -> T:
+        # Arrays without elements are made where they are used: as operands of `shard_map` they end
+        # jaxlib 0.11 in a segmentation fault (Shardy's ManualComputationUnusedInputsPattern).
+        filled = jax.tree.map(lambda x: x if np.size(x) else None, args)
+
+        def on_device(*given: Any) -> T:
+            def with_empty(spec: PartitionSpec, given: Any, whole: Any) -> Any:
+                def leaf(given: Any, whole: Any) -> Any:
+                    if given is not None or whole is None:
+                        return given
+                    shape = NamedSharding(mesh, spec).shard_shape(whole.shape)
+                    return jnp.zeros(shape, whole.dtype)
+
+                return jax.tree.map(leaf, given, whole, is_leaf=lambda x: x is None)
+
+            return function(*jax.tree.map(with_empty, in_specs, given, args, is_leaf=_is_spec))
+
+        spread = jax.shard_map(on_device, in_specs=in_specs, out_specs=out_specs, check_vma=False)
+        return spread(*filled)
+
+    return on_mesh
+
+
+def vmap(
+    function: Callable[..., Any], in_axes: Sequence[int | None], chunk: int | None = None
+) -> Callable[..., Any]:
+    """`jax.vmap` of a function, the batch shared out to the devices.
+
+    in_axes: 0 for arguments with the axis of the batch, None for others. All arrays must be
+        arguments: what a function closes over is not on the device.
+    chunk: how many of the batch a device computes together at most; all its share by default.
+        A batch that does not come out even is filled up with some of its rows again.
+    """
+
+    def of_batch(*args: Any) -> Any:
+        mapped = [arg for arg, axis in zip(args, in_axes, strict=True) if axis == 0]
+        size, shares = len(jax.tree.leaves(mapped)[0]), number()
+        of_each = -(-size // shares)
+        turns = -(-of_each // (chunk or of_each))
+        together = -(-of_each // turns)
+        rows = np.arange(shares * turns * together) % size
+
+        def of_device(*args: Any) -> Any:
+            if turns == 1:
+                return jax.vmap(function, in_axes)(*args)
+            mapped = [arg for arg, axis in zip(args, in_axes, strict=True) if axis == 0]
+
+            def of_one(row: list[Any]) -> Any:
+                own, all_ = iter(row), zip(args, in_axes, strict=True)
+                return function(*(next(own) if axis == 0 else arg for arg, axis in all_))
+
+            return jax.lax.map(of_one, mapped, batch_size=together)
+
+        of_all = shard(of_device, [ROWS if axis == 0 else WHOLE for axis in in_axes], ROWS)
+        if len(rows) == size:
+            return of_all(*args)
+        filled = [
+            arg if axis is None else jax.tree.map(lambda x: x[rows], arg)
+            for arg, axis in zip(args, in_axes, strict=True)
+        ]
+        return jax.tree.map(lambda x: x[:size], of_all(*filled))
+
+    return of_batch
+
+
+def shared_out(function: Callable[..., T], batch: int) -> Callable[..., T]:
+    """A compiled function that spreads batches of this size; its results are on one device."""
+
+    def on_mesh(*args: Any) -> T:
+        over = mesh(batch)
+        with jax.set_mesh(over):
+            result = function(*place(over, args))
+        machine.release_memory()
+        return gather(over, result)
+
+    return on_mesh
+
+
+def shapes(function: Callable[..., T], batch: int) -> Callable[..., T]:
+    """What `shared_out` of a function gives, of which only shapes are known; it is traced here."""
+
+    def on_mesh(*args: Any) -> T:
+        over = mesh(batch)
+        with jax.set_mesh(over):
+            return jax.eval_shape(function, *place(over, args))
+
+    return on_mesh
+
+
+def in_turns(function: Callable[[Any], T], batch: Any, at_a_time: int) -> T:
+    """What a function gives for all rows of leaves `[B, ...]`, of so many of which it is asked.
+
+    All results are in memory once, and those of one turn again.
+    """
+    size = len(jax.tree.leaves(batch)[0])
+    found = None
+    for first in range(0, size, at_a_time):
+        first = min(first, size - at_a_time)  # The last turn has some rows of the one before.
+        rows = slice(first, first + at_a_time)
+        given = function(jax.tree.map(lambda x, rows=rows: x[rows], batch))
+        if found is None:
+            found = _room(given, size)
+        found = _with_rows(found, given, first)
+    return cast(T, found)
+
+
+@partial(jax.jit, static_argnames="size")
+def _room(tree: T, size: int) -> T:
+    """Zeros `[size, ...]` for leaves `[..., ...]`."""
+    return jax.tree.map(lambda x: jnp.zeros((size, *x.shape[1:]), x.dtype), tree)
+
+
+@partial(jax.jit, donate_argnums=0)
+def _with_rows(tree: T, some: T, first: jax.Array) -> T:
+    """The tree with some of its rows, `first` and those that follow it, replaced."""
+    return jax.tree.map(
+        lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, first, axis=0), tree, some
+    )
+
+
+def share(tree: T) -> T:
+    """A pytree with leaves `[B, ...]`, each device with a share of the rows; it divides B."""
+    return _placed(tree, ROWS)
+
+
+def whole(tree: T) -> T:
+    """A pytree of which every device has all."""
+    return _placed(tree, WHOLE)
+
+
+def _placed(tree: T, places: PartitionSpec) -> T:
+    return jax.lax.with_sharding_constraint(tree, places) if number() > 1 else tree
+
+
+def _is_spec(leaf: Any) -> bool:
+    return isinstance(leaf, PartitionSpec)
