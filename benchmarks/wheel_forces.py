@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks._harness import measure, parser, report
+from vertiwm_jax.mechanics.bekker_wong import BekkerWongParams
 from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
-from vertiwm_jax.mechanics.wheel import Contact, Wheel, forces
+from vertiwm_jax.mechanics.wheel import Wheel
 from vertiwm_jax.terrain.soil import PRESETS, stack
 
 
@@ -17,13 +18,16 @@ def main() -> None:
     uniform = jax.random.uniform(jax.random.key(0), (5, options.wheels))
     soils = stack([PRESETS[name] for name in ("mud", "sand", "snow")])
     soil = jax.tree.map(lambda x: x[(uniform[0] * 3).astype(int)], soils)
-    wheel, contact = Wheel(jnp.float32(0.467), jnp.float32(0.254)), Contact()
+    wheel, contact = Wheel(jnp.float32(0.467), jnp.float32(0.254)), BekkerWongParams()
     sinkage, velocity_x = 0.1 * uniform[1], 5 * uniform[2]
     state = (sinkage, velocity_x, uniform[3] - 0.5, 12 * uniform[4])
     load = 6000 * jnp.ones_like(sinkage)
 
-    def total(wheel, soil, contact, *state):
-        return sum(jnp.sum(x) for x in jax.tree.leaves(forces(wheel, soil, contact, *state)))
+    def forces(wheel, soil, contact, *state):
+        return contact.forces(wheel, soil, *state)
+
+    def total(*arguments):
+        return sum(jnp.sum(x) for x in jax.tree.leaves(forces(*arguments)))
 
     cases = {
         "forces": (forces, state),

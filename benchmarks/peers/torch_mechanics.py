@@ -10,11 +10,11 @@ from benchmarks.peers import torch_motion as motion
 from benchmarks.peers.torch_query import Ground
 from benchmarks.peers.torch_touch import Touch, touch
 from benchmarks.peers.torch_wheel import WheelForces, gauss_legendre, rigid_forces, scm_forces
-from vertiwm_jax.mechanics.simulator import (
+from vertiwm_jax.mechanics.drivetrain import SPIN_FLOOR
+from vertiwm_jax.mechanics.simulator import CREEP_SPEED
+from vertiwm_jax.mechanics.suspension import (
     ADHESION_SPEED,
     CLIMB_SPEED,
-    CREEP_SPEED,
-    GRAVITY,
     HULL_DEPTH,
     HULL_FRICTION,
     HULL_LOAD,
@@ -23,8 +23,8 @@ from vertiwm_jax.mechanics.simulator import (
     LEAST_SINKAGE,
     LEAST_UPRIGHT,
     QUADRATURE_NODES,
-    SPIN_FLOOR,
 )
+from vertiwm_jax.mechanics.vehicle import GRAVITY
 from vertiwm_jax.state import STEP_SECONDS
 
 _STEERED = torch.tensor([1.0, 1.0, 0.0, 0.0])
@@ -170,7 +170,7 @@ class Simulator:
     def _suspend(
         self, wheels: Touch, travel: Tensor, sinkage: Tensor, leaving: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """droop, depth, upright, stiffness and carrying of `simulator._Press`, all `[B, 4]`."""
+        """What `suspension.WheelSupport` holds, in its order, all `[B, 4]`."""
         vehicle, seconds = self.vehicle, self.seconds
         upright = wheels.normal[..., 2].clamp(min=LEAST_UPRIGHT)
         damping = vehicle.damper / seconds

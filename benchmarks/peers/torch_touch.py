@@ -1,4 +1,4 @@
-"""Where vehicles touch the ground, in PyTorch: `vertiwm_jax.mechanics.touch` over a batch."""
+"""Where vehicles touch the ground, in PyTorch: `vertiwm_jax.mechanics.contact` over a batch."""
 
 from typing import Any, NamedTuple
 
@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from benchmarks.peers.torch_query import Ground, surface
-from vertiwm_jax.mechanics.touch import LEAST_YIELD, SHARED_DEPTH, TREAD_ANGLES
+from vertiwm_jax.mechanics.contact import LEAST_YIELD, SHARED_DEPTH, TREAD_ANGLES
 
 WHEELS = 4
 RIM_POINTS = 2 * len(TREAD_ANGLES)
@@ -17,8 +17,9 @@ _RIM_SIDE = torch.tensor([0.5, -0.5]).repeat(len(TREAD_ANGLES))[:, None]
 
 
 class Touch(NamedTuple):
-    """Contacts `[B, C]`, as `mechanics.touch.Touch`; vectors `[B, C, 3]` in body components.
+    """Contacts `[B, C]`, as `mechanics.contact.GroundContact`.
 
+    Vectors are `[B, C, 3]` in body components.
     soil: `[B, C, 6]`, in the order of `torch_query.SOIL`.
     """
 

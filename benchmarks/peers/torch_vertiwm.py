@@ -15,7 +15,7 @@ from benchmarks.peers.torch_mechanics import Memory, Simulator
 from benchmarks.peers.torch_networks import Cache, Encoder, Gate, SpecialistNetwork
 from benchmarks.peers.torch_query import Ground, patches, tensor
 from benchmarks.peers.torch_touch import WHEELS
-from vertiwm_jax.mechanics.simulator import GRAVITY
+from vertiwm_jax.mechanics.vehicle import GRAVITY
 from vertiwm_jax.networks.gate import HIDDEN
 from vertiwm_jax.world_model import step_features
 from vertiwm_jax.world_model.model import ModelConfig, VertiWM, VertiWMParams

@@ -32,7 +32,7 @@ def scm_forces(
     rut: Tensor,
     quadrature: tuple[Tensor, Tensor],
 ) -> WheelForces:
-    """Forces at a given sinkage, all `[B, 4]`; soil `[B, 4, 6]`, arguments as `scm.scm_forces`.
+    """Forces at a given sinkage, all `[B, 4]`; soil `[B, 4, 6]`, else as `ScmParams.forces`.
 
     quadrature: points and weights of `gauss_legendre`, which make a trailing axis of nodes.
     """

@@ -9,9 +9,8 @@ from scipy.optimize import brentq
 from vertiwm_jax.adaptation.soil_filter import SoilFilter
 from vertiwm_jax.evaluation import adaptation
 from vertiwm_jax.learning.dataset import Auxiliary, Drives
-from vertiwm_jax.mechanics.scm import scm_forces
-from vertiwm_jax.mechanics.simulator import GRAVITY, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.simulator import chrono_like
+from vertiwm_jax.mechanics.vehicle import GRAVITY, hmmwv
 from vertiwm_jax.mechanics.wheel import Wheel
 from vertiwm_jax.networks import soil_predictor
 from vertiwm_jax.terrain import map as terrain_map
@@ -87,7 +86,7 @@ def test_behaviour_is_that_under_a_quarter_of_the_weight():
 
     def forces(z):
         spin = 2.0 / 0.8 / vehicle.wheel_radius
-        return scm_forces(wheel, stiff, params.contact, z, 2.0, 0.0, spin)
+        return params.contact.forces(wheel, stiff, z, 2.0, 0.0, spin)
 
     load = float(vehicle.mass) * GRAVITY / 4
     expected = brentq(lambda z: float(forces(z).normal) - load, 1e-4, 0.3, xtol=1e-6)

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from vertiwm_jax.mechanics.newton_euler import (
     ContactForce,
-    Push,
+    DampedForce,
     Twist,
     _solve_spd,
     advance_twist,
@@ -60,7 +60,7 @@ def test_step_solves_the_dense_system(seed):
         damping = stiff * rng.random(count)
         contacts.append(
             ContactForce.of(
-                vector(arm), Push(vector(direction), jnp.asarray(push), jnp.asarray(damping))
+                vector(arm), DampedForce(vector(direction), jnp.asarray(push), jnp.asarray(damping))
             )
         )
         jacobian = np.concatenate([direction, np.cross(arm, direction)], axis=1)
@@ -106,7 +106,7 @@ def test_a_stiff_damper_stops_its_point_at_any_step_without_overshoot():
     down = vector(np.array([[0.0, 0.0, -1.0]]))
     arm = vector(np.array([[0.3, -0.2, -0.5]]))
     twist = Twist(vector(np.array([0.0, 0.0, -3.0])), vector(np.zeros(3)))
-    damper = ContactForce.of(arm, Push(down, -1e9 * jnp.ones(1) * 3.0, 1e9 * jnp.ones(1)))
+    damper = ContactForce.of(arm, DampedForce(down, -1e9 * jnp.ones(1) * 3.0, 1e9 * jnp.ones(1)))
     no_gravity = vector(np.zeros(3))
     for seconds in (0.001, 0.1):
         after = advance_twist(

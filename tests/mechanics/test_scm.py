@@ -8,16 +8,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vertiwm_jax.mechanics.scm import ScmContact, scm_forces
+from vertiwm_jax.mechanics.scm import ScmParams
 from vertiwm_jax.mechanics.wheel import MAX_SINKAGE, Wheel
 from vertiwm_jax.terrain.soil import PRESETS, stack
 
 WHEEL = Wheel(0.467, 0.254)
 SOILS = stack([PRESETS[name] for name in ("mud", "sand", "snow")])
 MUD, SAND, SNOW = 0, 1, 2
-SHARP = ScmContact(creep_speed=1e-5)
+SHARP = ScmParams(creep_speed=1e-5)
 """Shear as in Chrono: at full strength at any slip."""
-SMOOTH = ScmContact(creep_speed=0.4)
+SMOOTH = ScmParams(creep_speed=0.4)
+
+
+def scm_forces(wheel, soil, contact, *state, **nodes):
+    return contact.forces(wheel, soil, *state, **nodes)
+
+
 run = jax.jit(scm_forces, static_argnames="nodes")
 
 CASES = [  # soil, sinkage m, hub m/s, lateral m/s, rim m/s, rut m

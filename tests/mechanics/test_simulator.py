@@ -9,16 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vertiwm_jax.dynamics import rollout
+from vertiwm_jax.mechanics.bekker_wong import BekkerWongParams
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.mechanics.simulator import (
-    GRAVITY,
     Simulator,
     SimulatorHistory,
     SimulatorParams,
     chrono_like,
 )
-from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.mechanics.wheel import Contact
+from vertiwm_jax.mechanics.vehicle import GRAVITY, hmmwv
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.map import TerrainMap
@@ -237,7 +236,7 @@ def test_soil_slows_a_vehicle_down():
 
 @pytest.mark.parametrize("kind", [SAND, MUD, SNOW])
 def test_wongs_wheel_also_stands_and_drives_on_soil(kind):
-    wong, soil = replace(PARAMS, contact=Contact()), ground(kind=kind)
+    wong, soil = replace(PARAMS, contact=BekkerWongParams()), ground(kind=kind)
     standing = drive(soil, at_rest(soil), params=wong)
     assert loads(standing)[-1].sum() == pytest.approx(WEIGHT, rel=0.01)
     assert standing.history.sinkage[-1].min() > 0

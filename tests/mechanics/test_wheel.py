@@ -8,12 +8,19 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from vertiwm_jax.mechanics.bekker_wong import BekkerWongParams, slip
 from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
-from vertiwm_jax.mechanics.wheel import Contact, Wheel, forces, rigid_forces, slip
+from vertiwm_jax.mechanics.wheel import Wheel, rigid_forces
 from vertiwm_jax.terrain.soil import PRESETS, enlarged, stack
 
 WHEEL = Wheel(0.467, 0.254)
 SOILS = stack([PRESETS[name] for name in ("sand", "heavy_clay_25", "snow_us")])
+
+
+def forces(wheel, soil, contact, *state, **nodes):
+    return contact.forces(wheel, soil, *state, **nodes)
+
+
 run = jax.jit(forces, static_argnames="nodes")
 
 
@@ -80,7 +87,7 @@ def reference(soil, contact, sinkage, vx, vy, omega):
 
 
 def test_agrees_with_adaptive_quadrature():
-    contact = Contact(
+    contact = BekkerWongParams(
         peak=0.3,
         peak_slip=0.3,
         exit=-0.1,
@@ -113,8 +120,8 @@ def test_agrees_with_adaptive_quadrature():
 @pytest.mark.parametrize(
     "contact",
     [
-        Contact(rebound=0.9, slip_sinkage=0.2, skid_sinkage=0.3),
-        Contact(reversal="rankine", bulldozing="wong"),
+        BekkerWongParams(rebound=0.9, slip_sinkage=0.2, skid_sinkage=0.3),
+        BekkerWongParams(reversal="rankine", bulldozing="wong"),
     ],
 )
 def test_values_and_gradients_are_finite_in_every_corner(contact):
@@ -150,7 +157,7 @@ def test_gradients_agree_with_differences():
     step = np.array([1e-3, 2e-2, 2e-2, 5e-2])
 
     def outputs(x):
-        f = forces(WHEEL, soil, Contact(), *x, nodes=24)
+        f = forces(WHEEL, soil, BekkerWongParams(), *x, nodes=24)
         return jnp.stack([f.longitudinal, f.lateral, f.normal, f.torque])
 
     f = jax.jit(jax.vmap(outputs))
@@ -165,8 +172,8 @@ def test_gradients_agree_with_differences():
 
 def test_reversing_mirrors_driving():
     soil = jax.tree.map(lambda x: x[0], SOILS)
-    there = run(WHEEL, soil, Contact(), 0.04, 3.0, 0.5, 8.0)
-    back = run(WHEEL, soil, Contact(), 0.04, -3.0, 0.5, -8.0)
+    there = run(WHEEL, soil, BekkerWongParams(), 0.04, 3.0, 0.5, 8.0)
+    back = run(WHEEL, soil, BekkerWongParams(), 0.04, -3.0, 0.5, -8.0)
     np.testing.assert_allclose(back.longitudinal, -there.longitudinal, rtol=1e-6)
     np.testing.assert_allclose(back.torque, -there.torque, rtol=1e-6)
     np.testing.assert_allclose([back.lateral, back.normal], [there.lateral, there.normal])
@@ -176,12 +183,12 @@ def test_reversing_mirrors_driving():
 def test_no_jump_from_braking_through_rolling_to_driving_and_none_at_rest():
     soil = jax.tree.map(lambda x: x[0], SOILS)
     omega = np.linspace(-1.0, 9.0, 2001)
-    f = run(WHEEL, soil, Contact(), 0.03, 2.0, 0.2, omega)
+    f = run(WHEEL, soil, BekkerWongParams(), 0.03, 2.0, 0.2, omega)
     for x in jax.tree.leaves(f):
         assert np.max(np.abs(np.diff(x))) < 0.02 * np.max(f.normal)
 
     speed = np.linspace(-0.1, 0.1, 2001)
-    locked = run(WHEEL, soil, Contact(), 0.03, speed, 0.0, 0.0)
+    locked = run(WHEEL, soil, BekkerWongParams(), 0.03, speed, 0.0, 0.0)
     for x in jax.tree.leaves(locked):
         assert np.max(np.abs(np.diff(x))) < 0.02 * np.max(locked.normal)
     np.testing.assert_allclose(locked.longitudinal[1000], 0.0, atol=1e-2)
@@ -202,11 +209,13 @@ def test_equilibrium_carries_the_load_and_differentiates_implicitly():
 
     def sinkage(load, stiffness):
         soils = SOILS.replace(kphi=SOILS.kphi * stiffness)
-        return equilibrium_sinkage(WHEEL, soils, Contact(), load, *motion)
+        return equilibrium_sinkage(WHEEL, soils, BekkerWongParams(), load, *motion)
 
     solve = jax.jit(sinkage)
     z = solve(load, 1.0)
-    np.testing.assert_allclose(run(WHEEL, SOILS, Contact(), z, *motion).normal, load, rtol=1e-3)
+    np.testing.assert_allclose(
+        run(WHEEL, SOILS, BekkerWongParams(), z, *motion).normal, load, rtol=1e-3
+    )
     np.testing.assert_allclose(solve(np.zeros(3), 1.0), 0, atol=1e-6)
 
     ones = np.ones(3, np.float32)
@@ -222,7 +231,7 @@ def test_equilibrium_carries_the_load_and_differentiates_implicitly():
 
 def test_a_second_wheel_sinks_less_below_the_rut():
     motion = (4.0, 0.0, 10.0)
-    contact = Contact()
+    contact = BekkerWongParams()
     first = equilibrium_sinkage(WHEEL, SOILS, contact, 3000.0, *motion)
     second = equilibrium_sinkage(WHEEL, SOILS, contact, 3000.0, *motion, rut=first)
     assert np.all(second > 0.9 * first) and np.all(second - first < 0.9 * first)
@@ -258,7 +267,7 @@ def test_forces_in_a_soft_rut_are_finite_at_every_rounding() -> None:
     rut = jax.random.uniform(key[0], (200_000,), maxval=0.05)
     sinkage = jnp.abs(rut + 0.01 * jax.random.normal(key[1], rut.shape))
     speed = jax.random.uniform(key[2], rut.shape, maxval=5.0)
-    contact = Contact(unload_stiffness=1e6)
+    contact = BekkerWongParams(unload_stiffness=1e6)
     wheel, soil = Wheel(radius=0.467, width=0.254), PRESETS["mud"]
     out = jax.jit(forces)(wheel, soil, contact, sinkage, speed, 0.1, 1.2 * speed / 0.467, rut)
     for name, values in vars(out).items():
@@ -268,8 +277,13 @@ def test_forces_in_a_soft_rut_are_finite_at_every_rounding() -> None:
 @pytest.mark.parametrize("name", ["sand", "heavy_clay_25", "snow_us"])
 def test_a_wheel_ten_times_as_large_meets_enlarged_soil_as_froude_says(name):
     second, creep = 10**0.5, 0.05
-    small = run(Wheel(0.05, 0.04), PRESETS[name], Contact(creep_speed=creep), 0.004, 0.3, 0.05, 8.0)
-    contact, motion = Contact(creep_speed=second * creep), (second * 0.3, second * 0.05, 8 / second)
+    small = run(
+        Wheel(0.05, 0.04), PRESETS[name], BekkerWongParams(creep_speed=creep), 0.004, 0.3, 0.05, 8.0
+    )
+    contact, motion = (
+        BekkerWongParams(creep_speed=second * creep),
+        (second * 0.3, second * 0.05, 8 / second),
+    )
     large = run(Wheel(0.5, 0.4), enlarged(PRESETS[name], 10.0), contact, 0.04, *motion)
     for field in ("longitudinal", "lateral", "normal", "torque"):
         factor = 1e4 if field == "torque" else 1e3

@@ -4,9 +4,10 @@ import jax
 import numpy as np
 import pytest
 
-from vertiwm_jax.mechanics import stress
+from vertiwm_jax.mechanics import bekker_wong
+from vertiwm_jax.mechanics.bekker_wong import LOOSE_SAND, BekkerWongParams
 from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
-from vertiwm_jax.mechanics.wheel import LOOSE_SAND, Contact, Wheel, forces
+from vertiwm_jax.mechanics.wheel import Wheel
 from vertiwm_jax.terrain.soil import PRESETS, Soil, reece_moduli, stack
 
 INCH, POUND, PSI = 0.0254, 4.4482216, 6894.757
@@ -18,7 +19,7 @@ def settle(wheel, soil, contact, load, velocity_x, velocity_y, rim_speed):
     """Equilibrium sinkage and forces."""
     motion = (velocity_x, velocity_y, rim_speed / wheel.radius)
     sinkage = equilibrium_sinkage(wheel, soil, contact, load, *motion)
-    return sinkage, forces(wheel, soil, contact, sinkage, *motion)
+    return sinkage, contact.forces(wheel, soil, sinkage, *motion)
 
 
 def reece_soil(width_inch, k1, k2, n, cohesion, phi):
@@ -48,7 +49,7 @@ def entry_angle(sinkage, radius):
 )
 def test_driven_wheel_on_sand(soil, width, load, peak, slip, angle, sinkage, drawbar, torque):
     wheel = Wheel(24.7 * INCH, width * INCH)
-    contact = Contact(peak=peak, peak_slip=0.32, **EXACT)
+    contact = BekkerWongParams(peak=peak, peak_slip=0.32, **EXACT)
     z, f = settle(wheel, soil, contact, load * POUND, 10 * (1 - slip), 0.0, 10.0)
     got = [z / INCH, f.longitudinal / POUND, f.torque / POUND / INCH, f.normal / POUND]
     np.testing.assert_allclose(got, [sinkage, drawbar, torque, load], rtol=1e-3)
@@ -56,7 +57,7 @@ def test_driven_wheel_on_sand(soil, width, load, peak, slip, angle, sinkage, dra
 
 
 def test_towed_wheel_on_compact_sand():
-    contact = Contact(peak=0.43, peak_slip=0.32, reversal="rankine", **EXACT)
+    contact = BekkerWongParams(peak=0.43, peak_slip=0.32, reversal="rankine", **EXACT)
     wheel = Wheel(24.7 * INCH, 6 * INCH)
     skid = 0.216
     z, f = settle(wheel, COMPACT, contact, 2006 * POUND, 10 * (1 + skid), 0.0, 10.0)
@@ -66,9 +67,9 @@ def test_towed_wheel_on_compact_sand():
 
 def test_reversal_of_a_towed_wheel():
     wheel = Wheel(24.7 * INCH, 6 * INCH)
-    contact = Contact(reversal="rankine", **EXACT)
-    motion = stress.motion(wheel, 1e-4, 12.16, np.float32(0), np.float32(10 / wheel.radius))
-    patch = stress.patch(contact, COMPACT.friction_angle, np.float32(5.149 / 24.7), motion)
+    contact = BekkerWongParams(reversal="rankine", **EXACT)
+    motion = bekker_wong.motion(wheel, 1e-4, 12.16, np.float32(0), np.float32(10 / wheel.radius))
+    patch = bekker_wong.patch(contact, COMPACT.friction_angle, np.float32(5.149 / 24.7), motion)
     np.testing.assert_allclose(np.rad2deg(patch.reversal), 15.286, rtol=1e-3)
 
 
@@ -78,7 +79,7 @@ def test_reversal_of_a_towed_wheel():
 )
 def test_small_driven_wheel(slip, drawbar, torque, sinkage):
     soil = Soil(1.4e3, 820e3, 1.0, 1e3, np.pi / 4, 0.018, 0.0)
-    contact = Contact(peak=0.4, peak_slip=0.2, **EXACT)
+    contact = BekkerWongParams(peak=0.4, peak_slip=0.2, **EXACT)
     z, f = settle(Wheel(0.10, 0.06), soil, contact, 50.0, 10 * (1 - slip), 0.0, 10.0)
     np.testing.assert_allclose([z, f.longitudinal, f.torque], [sinkage, drawbar, torque], rtol=1e-3)
 
@@ -117,7 +118,7 @@ def test_measured_small_wheel(bulldozing):
         np.array([np.nan if x is None else x for x in column]) for column in zip(*rows, strict=True)
     )
     straight = angle == 0
-    contact = Contact(
+    contact = BekkerWongParams(
         peak=np.where(straight, 0.2024, 0.5697),
         peak_slip=np.where(straight, 0.7048, 0.1993),
         exit=np.where(straight, -0.4760, -0.5076),

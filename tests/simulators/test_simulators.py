@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.env import tasks
 from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.mechanics.simulator import GRAVITY, Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
+from vertiwm_jax.mechanics.vehicle import GRAVITY, hmmwv
 from vertiwm_jax.simulators import chrono
 from vertiwm_jax.simulators.builtin import BuiltIn
 from vertiwm_jax.simulators.chrono import Chrono

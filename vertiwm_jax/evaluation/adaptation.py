@@ -17,8 +17,8 @@ from vertiwm_jax.learning.rollouts import open_loop
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.learning.windows import GROUNDS, WindowIndex, Windows
 from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
-from vertiwm_jax.mechanics.scm import soil_forces
-from vertiwm_jax.mechanics.simulator import GRAVITY, SimulatorParams, stiffened
+from vertiwm_jax.mechanics.simulator import SimulatorParams, stiffened
+from vertiwm_jax.mechanics.vehicle import GRAVITY
 from vertiwm_jax.mechanics.wheel import Wheel
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
@@ -172,7 +172,7 @@ def behaviour(params: SimulatorParams, soil: Soil) -> tuple[jax.Array, jax.Array
     wheel, load = Wheel(vehicle.wheel_radius, vehicle.wheel_width), vehicle.mass * GRAVITY / 4
     motion = SPEED, 0.0, SPEED / (1 - SLIP) / vehicle.wheel_radius
     sinkage = equilibrium_sinkage(wheel, soil, params.contact, load, *motion)
-    return sinkage, soil_forces(wheel, soil, params.contact, sinkage, *motion).longitudinal
+    return sinkage, params.contact.forces(wheel, soil, sinkage, *motion).longitudinal
 
 
 def recovery(

@@ -1,10 +1,9 @@
-"""Where the soil carries the load: equilibrium sinkage, and Bekker's closed form."""
+"""Where the soil carries the load: equilibrium sinkage."""
 
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax.mechanics.scm import ScmContact, soil_forces
-from vertiwm_jax.mechanics.wheel import MAX_SINKAGE, Contact, Scalar, Wheel
+from vertiwm_jax.mechanics.wheel import MAX_SINKAGE, Scalar, SoilContact, Wheel
 from vertiwm_jax.terrain.soil import Soil
 
 _BISECTIONS = 26  # of 1.5 radii: past the last bit of float32
@@ -13,7 +12,7 @@ _BISECTIONS = 26  # of 1.5 radii: past the last bit of float32
 def equilibrium_sinkage(
     wheel: Wheel,
     soil: Soil,
-    contact: Contact | ScmContact,
+    contact: SoilContact,
     load: Scalar,
     velocity_x: Scalar,
     velocity_y: Scalar,
@@ -30,7 +29,7 @@ def equilibrium_sinkage(
 
     def unbalanced(sinkage: jax.Array) -> jax.Array:
         motion = velocity_x, velocity_y, omega
-        return soil_forces(wheel, soil, contact, sinkage, *motion, rut, nodes).normal - load
+        return contact.forces(wheel, soil, sinkage, *motion, rut, nodes).normal - load
 
     def bisect(residual, low: jax.Array) -> jax.Array:
         def halve(_, bracket: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

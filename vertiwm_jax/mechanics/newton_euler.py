@@ -15,7 +15,7 @@ class Twist(NamedTuple):
     angular: Vector
 
 
-class Push(NamedTuple):
+class DampedForce(NamedTuple):
     """Forces `[C]` along unit vectors, and how they answer to motion.
 
     direction: body components. force: N, at the current velocity.
@@ -39,15 +39,14 @@ class ContactForce(NamedTuple):
     damping: tuple[Vector, Vector, Vector]
 
     @classmethod
-    def of(cls, arm: Vector, *pushes: Push) -> Self:
-        """Several pushes on the same points."""
-        force = sum_of(push.direction.times(push.force) for push in pushes)
-        weighted = [push.direction.times(push.damping) for push in pushes]
+    def of(cls, arm: Vector, *forces: DampedForce) -> Self:
+        """Several forces on the same points."""
+        weighted = [force.direction.times(force.damping) for force in forces]
         x, y, z = (
-            sum_of(w.times(push.direction[i]) for w, push in zip(weighted, pushes, strict=True))
+            sum_of(w.times(force.direction[i]) for w, force in zip(weighted, forces, strict=True))
             for i in range(3)
         )
-        return cls(arm, force, (x, y, z))
+        return cls(arm, sum_of(force.direction.times(force.force) for force in forces), (x, y, z))
 
 
 def velocity_at(twist: Twist, arm: Vector) -> Vector:

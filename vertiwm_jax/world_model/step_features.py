@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.mechanics.simulator import GRAVITY, SimulatorHistory
-from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.mechanics.simulator import SimulatorHistory
+from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.normalisation import LOCAL, Normalisation

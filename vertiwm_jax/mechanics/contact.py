@@ -1,4 +1,4 @@
-"""Where a vehicle touches the ground: its treads and its hull against the map."""
+"""Where wheels and hull touch the ground."""
 
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ LEAST_YIELD = 0.01
 _RIM_ANGLES = np.repeat(np.asarray(TREAD_ANGLES, np.float32), 2)[:, None]
 
 
-class Touch(NamedTuple):
+class GroundContact(NamedTuple):
     """Contacts `[C]` of one kind; vectors in body components.
 
     point: m from the body origin, where the contact acts.
@@ -43,7 +43,7 @@ class Touch(NamedTuple):
 
 
 class _Samples(NamedTuple):
-    """Points of the vehicle `[...]` against the ground below them, as in `Touch`."""
+    """Points of the vehicle `[...]` against the ground below them, as in `GroundContact`."""
 
     point: Vector
     normal: Vector
@@ -52,7 +52,7 @@ class _Samples(NamedTuple):
     semantic: jax.Array
 
 
-def touch(
+def contacts(
     vehicle: Vehicle,
     terrain: TerrainMap,
     position: Vector,
@@ -60,7 +60,7 @@ def touch(
     travel: jax.Array,
     steering: jax.Array,
     sinkage: jax.Array,
-) -> tuple[Touch, Touch]:
+) -> tuple[GroundContact, GroundContact]:
     """Contacts of the four wheels `[4]` and of the deepest hull point `[1]`, in one query.
 
     travel: `[4]` m, height of the wheel centres in the body; steering: `[4]` rad; sinkage: `[4]`
@@ -83,7 +83,7 @@ def touch(
     on_tread = jax.tree.map(lambda x: x[:count].reshape(shape), samples)
     deepest = count + jnp.argmax(samples.depth[count:])[None]
     on_hull = jax.tree.map(lambda x: x[deepest], samples)
-    chassis = Touch(
+    chassis = GroundContact(
         point=on_hull.point,
         normal=on_hull.normal,
         depth=on_hull.depth,
@@ -95,9 +95,16 @@ def touch(
     return _wheel_contacts(terrain, on_tread, steering, sinkage), chassis
 
 
+def tangents(normal: Vector, cos: jax.Array, sin: jax.Array) -> tuple[Vector, Vector]:
+    """Directions in the tangent plane along and to the left of a heading in the body."""
+    rise = normal.x * cos + normal.y * sin
+    along = Vector(cos - rise * normal.x, sin - rise * normal.y, -rise * normal.z).normalised()
+    return along, normal.cross(along)
+
+
 def _wheel_contacts(
     terrain: TerrainMap, tread: _Samples, steering: jax.Array, sinkage: jax.Array
-) -> Touch:
+) -> GroundContact:
     """One contact `[4]` of each wheel, shared by the points `[2 angles, 4]` that carry it.
 
     A wheel is a cylinder. Testing points on both rims, rather than the ground under the hub,
@@ -123,7 +130,7 @@ def _wheel_contacts(
     upright = Vector(*map(shared, tread.normal)).normalised()
     # Of two soils that carry alike, that under the left rim.
     below = jnp.take_along_axis(tread.semantic, jnp.argmax(share, axis=0)[None], axis=0)[0]
-    return Touch(
+    return GroundContact(
         point=Vector(*map(shared, tread.point)),
         normal=Vector(*(jnp.where(edge, a, b) for a, b in zip(to_axle, upright, strict=True))),
         depth=shared(tread.depth) * jnp.where(edge, to_axle.z, 1.0),

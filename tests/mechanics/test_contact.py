@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from vertiwm_jax.dynamics import rollout
+from vertiwm_jax.mechanics.contact import LEAST_YIELD, GroundContact, contacts
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.touch import LEAST_YIELD, Touch, touch
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
@@ -31,13 +31,13 @@ def halves(left: int, right: int, lengthwise: bool = False) -> TerrainMap:
 
 def wheels(
     terrain: TerrainMap, x: float = 0.0, y: float = 0.0, depth: float = SUNK, sinkage: float = SUNK
-) -> Touch:
+) -> GroundContact:
     """Contacts of a level vehicle whose front left wheel is over (x, y), `depth` m deep."""
     at = VEHICLE.wheel_position[0]
     position = Vector(*jnp.array([x - at[0], y - at[1], RADIUS - depth], jnp.float32))
     axes = Axes.from_quaternion(jnp.array([1.0, 0, 0, 0]))
     still = jnp.zeros(4)
-    return touch(VEHICLE, terrain, position, axes, still, still, jnp.full(4, sinkage))[0]
+    return contacts(VEHICLE, terrain, position, axes, still, still, jnp.full(4, sinkage))[0]
 
 
 def test_on_one_kind_of_ground_the_contact_does_not_depend_on_sinkage():

@@ -1,4 +1,4 @@
-"""Stresses under a rigid wheel on soil: contact angles, normal stress, shear, bulldozing.
+"""The wheel in soil by Bekker and Wong: angles, normal stress, shear and bulldozing, summed up.
 
 Angles are from the downward vertical, positive towards the direction of travel. The soil is
 entered at th1, stressed most at thm, left at th2; where the wheel skids the flow of soil under
@@ -10,15 +10,26 @@ Wong, Theory of Ground Vehicles, 4th ed. (2008), ch. 2; Pavlov and Johnson, J. T
 (2024).
 """
 
+from functools import partial
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
+from vertiwm_jax.mechanics.wheel import (
+    MAX_SINKAGE,
+    MIN_SINKAGE,
+    Scalar,
+    Wheel,
+    WheelForces,
+    contact_angle,
+    sin_cos,
+)
 from vertiwm_jax.terrain.soil import Soil
 
-Scalar = jax.Array | float
+Arrays = tuple[jax.Array, ...]
 
 PANELS = 5
 """Pieces of the contact within which the stresses are smooth; see `breaks`."""
@@ -27,15 +38,7 @@ _MAX_PEAK = 0.98  # of th1; the peak stays inside the contact
 
 
 @struct.dataclass
-class Wheel:
-    """A rigid wheel `[...]`. radius, width: m."""
-
-    radius: Scalar
-    width: Scalar
-
-
-@struct.dataclass
-class Contact:
+class BekkerWongParams:
     """Empirical coefficients of wheel-soil contact `[...]`; s is slip, positive when driven.
 
     peak, peak_slip: thm = (peak + peak_slip max(s, 0)) th1.
@@ -63,6 +66,79 @@ class Contact:
     creep_speed: Scalar = 0.05
     reversal: Literal["linear", "rankine"] = struct.field(pytree_node=False, default="linear")
     bulldozing: Literal["ishigami", "wong"] = struct.field(pytree_node=False, default="ishigami")
+
+    def forces(
+        self,
+        wheel: Wheel,
+        soil: Soil,
+        sinkage: Scalar,
+        velocity_x: Scalar,
+        velocity_y: Scalar,
+        omega: Scalar,
+        rut: Scalar = 0.0,
+        nodes: int = 6,
+    ) -> WheelForces:
+        """As `SoilContact.forces`, continuous through every regime.
+
+        Six nodes in each of five pieces are within 0.1 % (99 % of random wheels, soils and
+        motions). Driven, braked, towed, reversing and standing wheels are one formula; values and
+        gradients are finite for any finite state. Only a wheel that spins against its travel as
+        fast as it travels jumps, when the direction in which it enters the soil changes.
+        """
+        arguments = (self, wheel, soil, sinkage, velocity_x, velocity_y, omega, rut)
+        arguments = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), arguments)
+        shape = jnp.broadcast_shapes(*(x.shape for x in jax.tree.leaves(arguments)))
+        contact, wheel, soil, sinkage, velocity_x, velocity_y, omega, rut = arguments
+
+        m = motion(wheel, contact.creep_speed, velocity_x, velocity_y, omega)
+        n = soil.n + contact.slip_sinkage * jnp.maximum(m.slip, 0.0)
+        n = n + contact.skid_sinkage * jnp.maximum(-m.slip, 0.0)
+        keq = soil.kc / wheel.width + soil.kphi
+        floor, unload = reloading(contact, keq, n, rut)
+
+        depth = jnp.clip((sinkage - floor) / wheel.radius, 0.0, MAX_SINKAGE)
+        touching = depth > MIN_SINKAGE
+        depth = jnp.where(touching, depth, MIN_SINKAGE)
+        p = patch(contact, soil.friction_angle, depth, m)
+        starts = jnp.stack(breaks(p, m))
+        extents = jnp.diff(starts, axis=0)
+
+        @partial(jax.checkpoint, prevent_cse=False)
+        def add_node(total: Arrays, node: Arrays) -> tuple[Arrays, None]:
+            panel, point, weight = node
+            extent = extents[panel]
+            at = arc(p, starts[panel] + point * extent)
+            z = wheel.radius * pressing_depth(p, at.angle)
+            sigma = normal_stress(keq, n, unload, floor, z)
+            tau_x, tau_y = shear_stress(soil, contact, p, m, at, sigma)
+            side = bulldozing(soil, contact, wheel.radius, p, m, at)
+            integrands = (
+                tau_x * at.cos - m.rolling * sigma * at.sin,
+                wheel.width * tau_y + side,
+                sigma * at.cos + m.rolling * tau_x * at.sin,
+                tau_x,
+            )
+            weight = weight * extent
+            return tuple(t + weight * y for t, y in zip(total, integrands, strict=True)), None
+
+        # A loop over nodes, each a pass over all wheels, is many times faster than an axis of
+        # nodes: nothing of a node goes through memory, nor, with the checkpoint, in the backward
+        # pass.
+        total, _ = jax.lax.scan(add_node, (jnp.zeros(shape),) * 4, _quadrature(nodes))
+        longitudinal, lateral, normal, torque = (jnp.where(touching, t, 0.0) for t in total)
+        area = wheel.radius * wheel.width
+        return WheelForces(
+            longitudinal=m.ahead * area * longitudinal,
+            lateral=wheel.radius * lateral,
+            normal=area * normal,
+            torque=m.ahead * area * wheel.radius * torque,
+        )
+
+
+COMPACT_SAND = BekkerWongParams(peak=0.43, peak_slip=0.32)
+"""Wong and Reece (1967)."""
+LOOSE_SAND = BekkerWongParams(peak=0.18, peak_slip=0.32)
+"""Wong and Reece (1967)."""
 
 
 class Motion(NamedTuple):
@@ -128,7 +204,9 @@ def motion(
     )
 
 
-def patch(contact: Contact, friction_angle: jax.Array, depth: jax.Array, m: Motion) -> Patch:
+def patch(
+    contact: BekkerWongParams, friction_angle: jax.Array, depth: jax.Array, m: Motion
+) -> Patch:
     """Where a wheel touches soil at `depth`, in wheel radii."""
     driven, braked = jnp.maximum(m.slip, 0.0), jnp.maximum(-m.slip, 0.0)
     entry = contact_angle(depth)
@@ -146,13 +224,6 @@ def patch(contact: Contact, friction_angle: jax.Array, depth: jax.Array, m: Moti
     rebound = contact_angle(contact.rebound * depth)
     leave = (contact.exit + contact.exit_slip * driven) * entry - rebound
     return Patch(entry, peak, jnp.minimum(leave, peak), reversal)
-
-
-def contact_angle(depth: jax.Array) -> jax.Array:
-    """acos(1 - depth) without its cancellation; zero, with zero slope, at depth <= 0."""
-    positive = depth > 0
-    half = jnp.sqrt(jnp.where(positive, depth, 1.0) / 2)
-    return jnp.where(positive, 2 * jnp.arcsin(half), 0.0)
 
 
 def breaks(p: Patch, m: Motion) -> tuple[jax.Array, ...]:
@@ -207,22 +278,9 @@ def pressing_depth(p: Patch, angle: jax.Array) -> jax.Array:
     return 2 * sin_a * (jnp.sin(p.entry) * cos_a - jnp.cos(p.entry) * sin_a)
 
 
-def sin_cos(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Sine and cosine for |x| < 2.1, to float32: the library's would take most of the time."""
-    y = x * x
-    sin = x * _horner(y, 1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
-    cos = _horner(y, 1, -1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600)
-    return sin, cos
-
-
-def _horner(x: jax.Array, *coefficients: float) -> jax.Array:
-    value = jnp.full_like(x, coefficients[-1])
-    for coefficient in coefficients[-2::-1]:
-        value = coefficient + x * value
-    return value
-
-
-def reloading(contact: Contact, keq: Scalar, n: Scalar, rut: Scalar) -> tuple[jax.Array, jax.Array]:
+def reloading(
+    contact: BekkerWongParams, keq: Scalar, n: Scalar, rut: Scalar
+) -> tuple[jax.Array, jax.Array]:
     """Depth in m of the floor of a rut after its elastic rebound, and its stiffness in Pa/m.
 
     rut: m deep while loaded; soil at 0 was never loaded and yields at once.
@@ -248,7 +306,7 @@ def normal_stress(
 
 
 def shear_stress(
-    soil: Soil, contact: Contact, p: Patch, m: Motion, at: Arc, sigma: jax.Array
+    soil: Soil, contact: BekkerWongParams, p: Patch, m: Motion, at: Arc, sigma: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Janosi-Hanamoto shear in Pa on the wheel: along the rim, forwards, and to the left."""
     mean = _mean_cosine(p)  # ahead of th0 the soil is pushed along with it
@@ -274,7 +332,7 @@ def shear_stress(
 
 
 def bulldozing(
-    soil: Soil, contact: Contact, radius: Scalar, p: Patch, m: Motion, at: Arc
+    soil: Soil, contact: BekkerWongParams, radius: Scalar, p: Patch, m: Motion, at: Arc
 ) -> jax.Array:
     """Side force per angle and wheel radius, N/(rad m), of the soil the wheel's flank pushes."""
     sin_slip_angle = -m.lateral * jax.lax.rsqrt(m.hub**2 + m.lateral**2 + contact.creep_speed**2)
@@ -292,3 +350,19 @@ def bulldozing(
     pressure = soil.unit_weight / 2 * (height * cotangent) ** 2 * (1 + cotangent * tangent / 2)
     pressure = pressure + 2 * height * soil.cohesion * cotangent
     return pressure * at.cos * sin_slip_angle * jnp.abs(sin_slip_angle)
+
+
+def _quadrature(nodes: int) -> Arrays:
+    """Panel, Gauss-Legendre point and weight on [0, 1] of every node, `[panels * nodes]`.
+
+    Crowded by a square towards the exit in the first panel and the entry in the last, where
+    stress grows like a power and shear like an exponential of the distance, by a cubic towards
+    both ends of those between, where shear reverses.
+    """
+    x, w = np.polynomial.legendre.leggauss(nodes)
+    x, w = (x + 1) / 2, w / 2
+    middle = (x**2 * (3 - 2 * x), 6 * x * (1 - x) * w)
+    panels = [(x**2, 2 * x * w), *[middle] * (PANELS - 2), (1 - x**2, 2 * x * w)]
+    points, weights = np.concatenate(panels, axis=1, dtype=np.float32)
+    panel = jnp.repeat(jnp.arange(PANELS), nodes)
+    return panel, jnp.asarray(points), jnp.asarray(weights)

@@ -1,0 +1,61 @@
+"""What a command does to the wheels: steering, driving torque, brakes."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.state import Command
+
+SPIN_FLOOR = 0.5
+"""Wheel speed, rad/s, below which a locked brake lets a wheel creep."""
+
+
+class Actuation(NamedTuple):
+    """What wheels are told to do.
+
+    steering: `[]` rad of the front wheels, as far as they have turned. angle: `[4]` rad of each.
+    torque: N m on each wheel, `[]` or `[4]`.
+    brake: `[4]` N m s/rad, braking torque per wheel speed.
+    """
+
+    steering: jax.Array
+    angle: jax.Array
+    torque: jax.Array
+    brake: jax.Array
+
+
+def actuate(
+    vehicle: Vehicle,
+    command: Command,
+    forward: jax.Array,
+    steering: jax.Array,
+    wheel_speed: jax.Array,
+    seconds: float,
+) -> Actuation:
+    """What a command is to the wheels in a sub-step; physics reads commands here alone.
+
+    Speed is controlled by a pedal in proportion to its error. Differentials are open: all wheels
+    get the same torque, limited by power at their mean speed; the engine fades out over the upper
+    half of its speed range.
+
+    Args:
+        forward: `[]` m/s, speed of the vehicle.
+        steering: `[]` rad, of the front wheels before.
+        wheel_speed: `[4]` rad/s.
+    """
+    pedal = jnp.clip(vehicle.speed_gain * (command.speed - forward), -1.0, 1.0)
+    target = jnp.clip(command.steering, -vehicle.steering_limit, vehicle.steering_limit)
+    turn = vehicle.steering_rate * seconds
+    steering = steering + jnp.clip(target - steering, -turn, turn)
+    mean_speed = jnp.maximum(jnp.abs(jnp.mean(wheel_speed)), 1.0)
+    torque = jnp.minimum(vehicle.wheel_torque, vehicle.wheel_power / mean_speed)
+    torque = torque * jnp.clip(2 - 2 * mean_speed / vehicle.wheel_speed_limit, 0.0, 1.0)
+    brake = vehicle.brake_torque / (jnp.abs(wheel_speed) + SPIN_FLOOR)
+    return Actuation(
+        steering=steering,
+        angle=jnp.concatenate([jnp.full(2, steering), jnp.zeros(2)]),
+        torque=jnp.maximum(pedal, 0.0) * torque,
+        brake=jnp.maximum(-pedal, 0.0) * brake,
+    )
