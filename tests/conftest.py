@@ -1,5 +1,6 @@
 import os
 import signal
+from pathlib import Path
 
 # The suite is a statement about the CPU in float32; before anything imports jax.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -31,6 +32,15 @@ if worker and hasattr(os, "sched_setaffinity"):
 
 # Shells start what runs in the background with Ctrl-C ignored, and tests press it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks all tests in the folders of commands, faults and golden numbers."""
+    folders = {Path(__file__).parent / name for name in ("integration", "faults", "golden")}
+    for item in items:
+        if folders & set(item.path.parents):
+            item.add_marker("integration")
 
 
 @pytest.fixture(scope="module", autouse=True)

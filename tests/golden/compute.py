@@ -67,7 +67,7 @@ STARTS = np.array(
 STEPS = 16
 KEPT = np.array([0, 3, 7, 15])
 """Steps whose states are kept, of `STEPS`."""
-# As tests/test_doors.py trains, where planning is a row more in the tests of policies.
+# As tests/integration/test_doors.py trains, where planning is a row more in the tests of policies.
 TRAINING = """
 ground: {train_worlds: 2, suites: [easy, obstacles], suite_worlds: 1, starts: 8, pairs: 2}
 navigation: {horizon_seconds: 3, settle_steps: 2}

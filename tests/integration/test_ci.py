@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-RUN = Path(__file__).parents[1] / ".ci" / "run"
+RUN = Path(__file__).parents[2] / ".ci" / "run"
 ABORTS = "import os; os.abort()"
 
 

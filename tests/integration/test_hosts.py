@@ -16,7 +16,7 @@ import trainee
 from vertiwm_jax import checkpoints, ppo, runs
 
 ITERATIONS = trainee.STOPPED + 3
-TESTS = Path(__file__).parent
+TESTS = Path(__file__).parents[1]
 # To import the trainee starts JAX.
 TRAINEE = "-c", "from vertiwm_jax import hosts; hosts.join('ppo'); import trainee; trainee.main()"
 TINY = """

@@ -25,7 +25,7 @@ from vertiwm_jax.rl.off_policy import OffPolicy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
 
-OPEN = Path(__file__).parents[1] / "data" / "open"
+OPEN = Path(__file__).parents[2] / "data" / "open"
 
 
 def devices_of(mesh, function, *args):

@@ -16,7 +16,7 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax.collect import Collect
 from vertiwm_jax.ppo import PPOTraining
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 WITH_EXAMPLES = [
     pytest.param("README.md", marks=pytest.mark.smoke),

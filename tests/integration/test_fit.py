@@ -19,7 +19,7 @@ from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.world_model import model
 from vertiwm_jax.world_model.choice import choose
 
-RECORDED = Path(__file__).parent / "data" / "chrono_drives"
+RECORDED = Path(__file__).parents[1] / "data" / "chrono_drives"
 STAGES = (
     "nesam_autoencoders", "nesam_soil", "nesam_single_steps", "nesam_rollouts",
     "transformer_autoencoders", "transformer_single_steps", "transformer_rollouts", "gate",
