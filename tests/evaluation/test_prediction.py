@@ -9,7 +9,7 @@ import pytest
 from vertiwm_jax.evaluation import error_sources, prediction
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.learning.windows import Windows, cut
+from vertiwm_jax.learning.windows import Windows, gather, index
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
@@ -188,7 +188,7 @@ def test_error_is_found_where_it_is():
 
 def test_the_built_in_simulator_beats_both_baselines_on_chrono_drives():
     drives, terrain = dataset.load(DRIVES, "train")
-    windows = cut(drives, terrain, context=16, horizon=16, stride=16)
+    windows = gather(drives, index(drives, terrain, context=16, horizon=16, stride=16))
     vehicle = hmmwv()
     models = (
         (Simulator(), chrono_like(vehicle)),

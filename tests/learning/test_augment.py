@@ -10,7 +10,7 @@ from vertiwm_jax import geometry
 from vertiwm_jax.dynamics import rollout, warm_up
 from vertiwm_jax.learning import augment, dataset
 from vertiwm_jax.learning.dataset import Auxiliary
-from vertiwm_jax.learning.windows import Windows, cut
+from vertiwm_jax.learning.windows import Windows, gather, index
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.state import Command, VehicleState
@@ -148,7 +148,7 @@ def test_some_are_mirrored_and_the_others_left_alone(both):
 
 def test_the_simulator_drives_the_mirror_image_of_what_it_drives():
     drives, terrain = dataset.load(DRIVES, "train")
-    windows = cut(drives, terrain, context=C, horizon=16, stride=20)
+    windows = gather(drives, index(drives, terrain, context=C, horizon=16, stride=20))
     both = augment.with_mirrored(terrain)
     simulator, params = Simulator(), chrono_like(hmmwv())
 

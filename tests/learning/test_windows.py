@@ -7,7 +7,7 @@ from learning.recordings import GRASS, SNOW, STEPS, auxiliary, write
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning import windows as prediction_windows
 from vertiwm_jax.learning.schema import DataError
-from vertiwm_jax.learning.windows import GROUNDS, cut, gather
+from vertiwm_jax.learning.windows import GROUNDS, gather, index
 
 
 def test_windows_hold_consecutive_steps_within_the_valid_ones(tmp_path):
@@ -15,7 +15,7 @@ def test_windows_hold_consecutive_steps_within_the_valid_ones(tmp_path):
     length[23] = 21
     write(tmp_path, length=length)
     loaded, terrain = dataset.load(tmp_path, "test")
-    windows = cut(loaded, terrain, context=12, horizon=8, stride=5)
+    windows = gather(loaded, index(loaded, terrain, context=12, horizon=8, stride=5))
     # (40 - 20) // 5 + 1 of the drives of 40 steps, one of the drive of 21.
     speeds = np.asarray(windows.state[:, 0, 6])
     np.testing.assert_allclose(np.unique(speeds, return_counts=True)[0], [3.2, 3.3, 3.4])
@@ -36,7 +36,7 @@ def test_ground_of_a_window_is_that_under_its_predicted_steps(tmp_path):
     classes[22, 15:, 0] = SNOW
     write(tmp_path, wheel_class=classes)
     loaded, terrain = dataset.load(tmp_path, "test")
-    windows = cut(loaded, terrain, context=12, horizon=8, stride=100)
+    windows = gather(loaded, index(loaded, terrain, context=12, horizon=8, stride=100))
     assert [GROUNDS[i] for i in windows.ground] == ["transition", "deformable", "rigid"]
 
 
@@ -44,14 +44,14 @@ def test_drives_shorter_than_a_window_are_refused(tmp_path):
     write(tmp_path)
     loaded, terrain = dataset.load(tmp_path, "test")
     with pytest.raises(DataError, match="at least 60 steps, found at most 40"):
-        cut(loaded, terrain, context=30, horizon=30)
+        gather(loaded, index(loaded, terrain, context=30, horizon=30))
 
 
 def test_windows_hold_what_was_recorded_beside_the_states(tmp_path):
     recorded = auxiliary()
     write(tmp_path, wheel_force=recorded["wheel_force"], steer_angle=recorded["steer_angle"])
     loaded, terrain = dataset.load(tmp_path, "test")
-    windows = cut(loaded, terrain, context=12, horizon=8, stride=20)
+    windows = gather(loaded, index(loaded, terrain, context=12, horizon=8, stride=20))
     force = recorded["wheel_force"][22:]
     expected = np.stack([force[d, s : s + 21] for d in range(3) for s in (0, 20)])
     np.testing.assert_array_equal(windows.auxiliary.wheel_force, expected)
@@ -63,7 +63,7 @@ def test_a_gathered_batch_is_those_windows_of_all(tmp_path):
     write(tmp_path, "a.npz", **auxiliary())
     write(tmp_path, "b.npz", **auxiliary())
     loaded, terrain = dataset.load(tmp_path, "train")
-    every = cut(loaded, terrain, context=6, horizon=4)
+    every = gather(loaded, index(loaded, terrain, context=6, horizon=4))
     places = prediction_windows.index(loaded, terrain, context=6, horizon=4)
     rows = jnp.array([300, 0, 7, 7])
     drives = jax.device_put(loaded)
