@@ -54,9 +54,9 @@ def across(xy):
 def test_the_mirrored_ground_is_the_ground_at_the_mirrored_place(both):
     terrain_map.validate(both)
     xy = points()
-    for index in (0, 1):
-        here = query.surface(both.select(jnp.int32(index)), xy)
-        there = query.surface(both.select(jnp.int32(index + 2)), across(xy))
+    for world in (0, 1):
+        here = query.surface(both.select(jnp.int32(world)), xy)
+        there = query.surface(both.select(jnp.int32(world + 2)), across(xy))
         np.testing.assert_array_equal(there.semantic, here.semantic)
         np.testing.assert_array_equal(there.friction, here.friction)
         # On triangles of rigid ground as on soil; metres, with coordinates rounded to 1e-6 m.
