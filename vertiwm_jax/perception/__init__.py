@@ -1,0 +1,1 @@
+"""The look at the ground: one function, `perceive` (Eq. 1)."""
