@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import runs
+from vertiwm_jax import froude, runs
 from vertiwm_jax.config import AtLeastOne, ConfigError, settings
 from vertiwm_jax.importers import collection, grid_map, resampling, rosbag, table, tartandrive
 from vertiwm_jax.importers.log import Log
@@ -22,7 +22,7 @@ from vertiwm_jax.learning.dataset import SPLITS
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.runs import Progress, RunError
 from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain.map import MapError, TerrainMap, enlarged
+from vertiwm_jax.terrain.map import MapError, TerrainMap
 
 Format = Literal["csv", "parquet", "rosbag", "tartandrive"]
 READERS: dict[Format, Callable[[Path, ImportSettings], list[Log]]] = {
@@ -125,14 +125,14 @@ def _terrain(command: ImportDrives, settings: ImportSettings) -> tuple[TerrainMa
     if command.map is not None:
         if command.map.is_dir():
             raise DataError(f"{command.map}: expected the .npz map of one world, found a folder")
-        return enlarged(files.load(command.map), settings.vehicle.scale, str(command.map)), []
+        return froude.scaled(files.load(command.map), settings.vehicle.scale), []
     if settings.rosbag is None or settings.rosbag.grid_map is None:
         raise DataError(
             f"{command.settings}: expected ground: give `--map MAP.npz`, which terrain.files.save "
             "writes (docs/own-map.md), or name a bag's GridMap topic in rosbag.grid_map"
         )
     terrain, unknown = grid_map.terrain(command.sources, settings.rosbag.grid_map, settings.frames)
-    terrain = enlarged(terrain, settings.vehicle.scale, settings.rosbag.grid_map.topic)
+    terrain = froude.scaled(terrain, settings.vehicle.scale)
     return terrain, [f"{unknown:.0%} of the map had no height, and took that of the nearest cell"]
 
 

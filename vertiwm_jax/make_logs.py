@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import runs
+from vertiwm_jax import froude, runs
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.importers import noise
 from vertiwm_jax.importers.noise import NoiseConfig
@@ -22,7 +22,7 @@ from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
 from vertiwm_jax.runs import RunError
 from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain.map import MapError, enlarged
+from vertiwm_jax.terrain.map import MapError
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def make_logs(command: MakeLogs) -> tuple[float, list[str]]:
             rows_written += len(rows)
             runs.write_atomic(unfinished / f"{source.stem}.csv", _text(rows))
             terrain = files.load(schema.find_map(source, meta["map"]))
-            small = enlarged(terrain, 1 / driven.scale, meta["map"])
+            small = froude.scaled(terrain, 1 / driven.scale)
             files.save(small, unfinished / "maps" / source.name)
         configuration.save(_settings(driven), unfinished / "settings.yaml")
     kept = 1 - command.noise.dropped

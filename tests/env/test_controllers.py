@@ -27,7 +27,7 @@ def command(terrain, goal):
 def ground(height):
     x = np.arange(-64.0, 65.0)
     elevation = height(*np.meshgrid(x, -x)) + np.zeros((129, 129))
-    return terrain_map.build(elevation, np.full((16, 16), GRASS), elevation_range=(-100, 100))
+    return terrain_map.build(elevation, np.full((16, 16), GRASS))
 
 
 FLAT = ground(lambda x, y: 0 * x)

@@ -92,9 +92,7 @@ def test_poses_lie_on_the_arcs_of_a_bicycle():
 def on_ground(height):
     """What the ground does to a vehicle at (0, 0) that looks 0.4 rad to the north of east."""
     x = np.arange(-64.0, 65.0)
-    terrain = terrain_map.build(
-        height(*np.meshgrid(x, -x)), np.full((16, 16), GRASS), elevation_range=(-1000, 1000)
-    )
+    terrain = terrain_map.build(height(*np.meshgrid(x, -x)), np.full((16, 16), GRASS))
     seen = observe(terrain, vehicle(0.0, 0.0, 0.4), jnp.ones(3), jnp.zeros(2))
     return np.asarray(seen)[observation.GROUND].reshape(6, -1)
 

@@ -89,14 +89,12 @@ def of_a_later_version(whole):
     ],
     ids=["empty", "renamed", "damaged", "unknown compression", "encrypted", "later version"],
 )
-@fault(Escaped, "maps that cannot be read end in the errors of what reads them")
 def test_a_damaged_map_is_refused(good, damage):
     good.write_bytes(damage(good.read_bytes()))
     message = refusal(lambda: files.load(good), MapError)
     assert message.startswith(f"{good}: file: expected an .npz map")
 
 
-@fault(Escaped, "a byte that is wrong ends in an error of zlib or of zipfile")
 def test_a_byte_anywhere_in_a_map_may_be_wrong(good):
     whole = good.read_bytes()
     for place in range(0, len(whole), 13):
@@ -132,8 +130,6 @@ OF_ANOTHER_TYPE = {
     "origin in words": ("origin", lambda whole: np.array(["west", "north"])),
     "a list": ("meta", lambda whole: "[]"),
     "a number": ("meta", lambda whole: "3"),
-    "no range": ("meta", lambda whole: meta(whole, elevation_range=3)),
-    "a range in words": ("meta", lambda whole: meta(whole, elevation_range=["low", "high"])),
     "no classes": ("meta", lambda whole: meta(whole, classes=3)),
     "classes by number": ("meta", lambda whole: meta(whole, classes=list(range(10)))),
     "a list of soils": ("meta", lambda whole: meta(whole, soils=[])),
@@ -144,7 +140,6 @@ OF_ANOTHER_TYPE = {
 
 
 @pytest.mark.parametrize("case", OF_ANOTHER_TYPE)
-@fault(Escaped, "what is of another type than expected ends in TypeError, ValueError and others")
 def test_what_a_map_holds_may_be_of_another_type(good, case):
     name, changed = OF_ANOTHER_TYPE[case]
     arrays = dict(np.load(good))
@@ -172,14 +167,12 @@ HEIGHTS = {
 
 
 @pytest.mark.parametrize("name", HEIGHTS)
-@fault(Escaped, "heights that cannot be read end in the errors of what reads them")
 def test_damaged_heights_are_refused(tmp_path, name):
     (tmp_path / name).write_bytes(HEIGHTS[name])
     message = refusal(lambda: files.from_heightmap(tmp_path / name, 1.0), MapError)
     assert message.startswith(f"{tmp_path / name}: elevation: expected")
 
 
-@fault(Escaped, "an image of classes that cannot be read ends in the error of what reads it")
 def test_damaged_classes_are_refused(tmp_path):
     np.save(tmp_path / "heights.npy", np.ones((21, 21)))
     classes = tmp_path / "classes.npy"

@@ -93,9 +93,7 @@ def logged(
 
 def terrain() -> terrain_map.TerrainMap:
     """Level ground of 60 m by 60 m below the drive."""
-    return terrain_map.build(
-        np.full((61, 61), -1.0), np.full((8, 8), 3), elevation_range=(-4.0, 12.0)
-    )
+    return terrain_map.build(np.full((61, 61), -1.0), np.full((8, 8), 3))
 
 
 def errors(found: np.ndarray, time: np.ndarray) -> np.ndarray:

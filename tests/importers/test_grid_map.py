@@ -12,7 +12,6 @@ from vertiwm_jax.importers.grid_map import Canvas
 from vertiwm_jax.importers.settings import Frames, GridMapSettings
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.terrain import query
-from vertiwm_jax.terrain.map import MapError
 
 LAYERS = GridMapSettings("/map", semantic="kind")
 SAND, GRASS = 8, 3
@@ -93,10 +92,5 @@ def test_maps_that_cannot_be_used_are_named(tmp_path):
     for (name, layers), message in cases.items():
         with pytest.raises(DataError, match=message):
             grid_map.terrain([tmp_path / name], layers, Frames())
-    with Bag(tmp_path / "c") as bag:
-        bag.grid_map(1.0, patch((0.0, 0.0)), (0, 0), RESOLUTION)
-    lifted = Frames(origin=(0.0, 0.0, 8.0))
-    with pytest.raises(MapError, match="elevation_range"):
-        grid_map.terrain([tmp_path / "c"], LAYERS, lifted)
     with pytest.raises(ValueError, match=r"ground: expected one of clay, .*, found lava"):
         GridMapSettings("/map", ground="lava")

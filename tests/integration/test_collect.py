@@ -214,7 +214,7 @@ def test_starts_are_level_roomy_and_near_borders(maps):
         way = np.linspace(x, end[0], 50)
         assert 0.05 < np.mean((way > -16) & (way < 0)) < 0.95
     slope = np.broadcast_to(0.4 * np.arange(65.0), (65, 65))
-    steep = terrain_map.build(slope, np.full((8, 8), GRASS), elevation_range=(0, 64))
+    steep = terrain_map.build(slope, np.full((8, 8), GRASS))
     with pytest.raises(SimulatorError, match="20 degrees or less"):
         excitation.start(np.random.default_rng(0), steep, 16.0)
 

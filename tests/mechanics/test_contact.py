@@ -24,9 +24,7 @@ def halves(left: int, right: int, lengthwise: bool = False) -> TerrainMap:
     """Flat ground of two classes that meet at x = 0, or at y = 0 with `left` at y > 0."""
     classes = np.full((8, 8), left)
     classes[(slice(4, None), slice(None)) if lengthwise else (slice(None), slice(4, None))] = right
-    return terrain_map.build(
-        np.zeros((65, 65)), classes, np.full((8, 8), 0.8), elevation_range=(-1, 1)
-    )
+    return terrain_map.build(np.zeros((65, 65)), classes, np.full((8, 8), 0.8))
 
 
 def wheels(

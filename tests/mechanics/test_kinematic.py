@@ -27,7 +27,7 @@ PARAMS = BicycleParams(
 def plane(rise_x: float, rise_y: float) -> TerrainMap:
     x = np.arange(65) - 32.0
     heights = 50 + rise_x * x[None, :] - rise_y * x[:, None]
-    return terrain_map.build(heights, np.full((8, 8), 3), elevation_range=(0, 100))
+    return terrain_map.build(heights, np.full((8, 8), 3))
 
 
 def matrix(state: VehicleState) -> np.ndarray:

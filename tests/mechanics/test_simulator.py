@@ -52,7 +52,6 @@ def ground(
         height(x, y),
         np.full((8, 8), kind),
         np.full((8, 8), friction),
-        elevation_range=(-100, 100),
         origin=(centre[0] - 32, centre[1] + 32),
     )
 

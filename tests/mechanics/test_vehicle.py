@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from vertiwm_jax import config
+from vertiwm_jax import config, froude
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics import vehicle
@@ -45,9 +45,11 @@ def test_a_rover_at_full_size_is_about_an_hmmwv():
 @pytest.mark.parametrize(
     ("field", "value", "words"),
     [
-        ("mass", -3.5, "mass: expected > 0, found -3.5"),
-        ("scale", 0.0, "scale: expected > 0, found 0.0"),
-        ("track", ".nan", "track: expected finite numbers"),
+        ("mass", -3.5, "mass: expected more than 0, found -3.5"),
+        ("scale", 0.0, "scale: expected more than 0, found 0.0"),
+        ("track", ".nan", "track: expected more than 0, found nan"),
+        ("track", ".inf", "track: expected finite numbers"),
+        ("free_travel", [0.1, ".nan"], "free_travel: expected finite numbers"),
         ("spring", [1.0], "spring: expected a list of 2 (float, float), found a list of 1"),
         ("hull", [0.1, 0.1, 0.2, 0.1], "hull: expected half the length and half the width"),
         ("inertia", [1.0, 2.0, 9.0], "inertia: expected no moment larger than the sum"),
@@ -58,7 +60,7 @@ def test_a_rover_at_full_size_is_about_an_hmmwv():
 def test_what_cannot_be_a_vehicle_is_named(tmp_path, field, value, words):
     numbers = yaml.safe_load(config.dump(ROVER)) | {field: value}
     file = tmp_path / "mine.yaml"
-    file.write_text(yaml.safe_dump(numbers).replace("'.nan'", ".nan"))
+    file.write_text(yaml.safe_dump(numbers).replace("'.nan'", ".nan").replace("'.inf'", ".inf"))
     with pytest.raises(ConfigError) as refused:
         vehicle.load(str(file))
     assert str(refused.value).startswith(f"{file}: ") and words in str(refused.value)
@@ -83,7 +85,7 @@ def test_the_same_drive_at_four_times_the_size_takes_twice_as_long():
 
     def driven(scale, held, substeps):
         params = chrono_like(replace(ROVER, scale=scale).vehicle)
-        ground, model = terrain_map.enlarged(terrain, scale), Simulator(substeps)
+        ground, model = froude.scaled(terrain, scale), Simulator(substeps)
         size = params.vehicle.wheelbase, params.vehicle.track, params.vehicle.wheel_radius
         start = rest_on_ground(ground, jnp.zeros(2), jnp.float32(0.3), *size)
         state = VehicleState(*start, jnp.zeros(3), jnp.zeros(3))

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from vertiwm_jax import froude
 from vertiwm_jax.mechanics.bekker_wong import BekkerWongParams, slip
 from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
 from vertiwm_jax.mechanics.wheel import Wheel, rigid_forces
-from vertiwm_jax.terrain.soil import PRESETS, enlarged, stack
+from vertiwm_jax.terrain.soil import PRESETS, stack
 
 WHEEL = Wheel(0.467, 0.254)
 SOILS = stack([PRESETS[name] for name in ("sand", "heavy_clay_25", "snow_us")])
@@ -275,7 +276,7 @@ def test_forces_in_a_soft_rut_are_finite_at_every_rounding() -> None:
 
 
 @pytest.mark.parametrize("name", ["sand", "heavy_clay_25", "snow_us"])
-def test_a_wheel_ten_times_as_large_meets_enlarged_soil_as_froude_says(name):
+def test_a_wheel_ten_times_as_large_meets_soil_as_froude_says(name):
     second, creep = 10**0.5, 0.05
     small = run(
         Wheel(0.05, 0.04), PRESETS[name], BekkerWongParams(creep_speed=creep), 0.004, 0.3, 0.05, 8.0
@@ -284,7 +285,7 @@ def test_a_wheel_ten_times_as_large_meets_enlarged_soil_as_froude_says(name):
         BekkerWongParams(creep_speed=second * creep),
         (second * 0.3, second * 0.05, 8 / second),
     )
-    large = run(Wheel(0.5, 0.4), enlarged(PRESETS[name], 10.0), contact, 0.04, *motion)
+    large = run(Wheel(0.5, 0.4), froude.scaled(PRESETS[name], 10.0), contact, 0.04, *motion)
     for field in ("longitudinal", "lateral", "normal", "torque"):
         factor = 1e4 if field == "torque" else 1e3
         found, expected = getattr(large, field), factor * getattr(small, field)

@@ -43,8 +43,8 @@ def ground(west=CONCRETE, east=CONCRETE, slope=0.0, origin=(100.0, 64.0)):
     elevation = np.broadcast_to(slope * np.arange(129.0), (129, 129))
     semantic = np.full((16, 16), west)
     semantic[:, 8:] = east
-    friction, heights = np.full((16, 16), 0.8), (0, 100)
-    return terrain_map.build(elevation, semantic, friction, origin=origin, elevation_range=heights)
+    friction = np.full((16, 16), 0.8)
+    return terrain_map.build(elevation, semantic, friction, origin=origin)
 
 
 def drive(simulator, start, commands):

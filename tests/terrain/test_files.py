@@ -92,9 +92,7 @@ def test_save_keeps_the_selected_world_and_classes_of_ones_own(tmp_path):
         soils={"regolith": STANDARD.soils["sand"].replace(kphi=np.float32(820e3))},
     )
     worlds = [
-        terrain_map.build(
-            np.full((9, 9), height), [[0, 1], [1, 0]], elevation_range=(-5, 5), classes=classes
-        )
+        terrain_map.build(np.full((9, 9), height), [[0, 1], [1, 0]], classes=classes)
         for height in (-1, 2)
     ]
     files.save(terrain_map.stack(worlds).select(1), tmp_path / "moon.npz")

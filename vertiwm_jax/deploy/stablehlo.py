@@ -14,7 +14,7 @@ from vertiwm_jax.env.route import Routes
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.classes import STANDARD
-from vertiwm_jax.terrain.map import ELEVATION_RANGE, TerrainMap
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.perception import Eyes
 
 PLATFORMS = ("cpu", "cuda")
@@ -75,7 +75,6 @@ def _terrain(
         obstacles=obstacles[None],
         origin=origin,
         resolution=resolution,
-        elevation_range=jnp.array(ELEVATION_RANGE),
         class_rgb=jnp.asarray(STANDARD.rgb),
         deformable=jnp.asarray(STANDARD.deformable),
         soils=STANDARD.stacked_soils(),

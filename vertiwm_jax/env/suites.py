@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax import froude
 from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, NotNegative, settings
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.tasks import Tasks, circle_tasks, random_tasks
 from vertiwm_jax.terrain import files, vertibench, worlds
-from vertiwm_jax.terrain.map import TerrainMap, enlarged, stack
+from vertiwm_jax.terrain.map import TerrainMap, stack
 from vertiwm_jax.terrain.worlds import MEDIAN_SLOPE_DEG, WorldConfig
 
 Suite = Literal["easy", "hard", "obstacles"]
@@ -90,7 +91,7 @@ def load(config: GroundConfig, path: Path, scale: float = 1.0) -> TerrainMap:
     scale: of a small vehicle that is brought to full size, with the ground that it drives on.
     """
     terrain = vertibench.load(path) if (path / "envs").is_dir() else files.load(path)
-    terrain = enlarged(terrain, scale, str(path))
+    terrain = froude.scaled(terrain, scale)
     return terrain if config.obstacles else replace(terrain, obstacles=terrain.obstacles[:, :0])
 
 

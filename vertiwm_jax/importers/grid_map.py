@@ -97,7 +97,6 @@ def _build(
         _rows(ground),
         resolution=canvas.resolution,
         origin=(west, north),
-        elevation_range=wanted.elevation_range,
         name=name,
     )
     return built, float(1 - known.mean())

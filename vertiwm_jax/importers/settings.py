@@ -5,7 +5,6 @@ from typing import Literal
 
 from vertiwm_jax.config import Positive, settings
 from vertiwm_jax.terrain.classes import STANDARD
-from vertiwm_jax.terrain.map import ELEVATION_RANGE
 
 Triple = tuple[float, float, float]
 Names = tuple[str, str, str]
@@ -137,8 +136,6 @@ class GridMapSettings:
     """Layer of class ids; by default all ground is of one class."""
     ground: str = "grass"
     """That class, also where the layer has none."""
-    elevation_range: tuple[float, float] = ELEVATION_RANGE
-    """m within which all heights lie; models know that of the default."""
 
     def check(self):
         if self.ground not in STANDARD.names:

@@ -1,15 +1,17 @@
 """What a four-wheeled vehicle is: masses, suspension, drivetrain, controller, limits."""
 
-from dataclasses import dataclass
+from dataclasses import fields
 from functools import cache
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import jax
 import numpy as np
 from flax import struct
 
 from vertiwm_jax import config as configuration
+from vertiwm_jax import froude
+from vertiwm_jax.config import Positive, settings
 
 GRAVITY = 9.81
 HMMWV = "hmmwv"
@@ -83,71 +85,67 @@ class Vehicle:
         return self.free_travel + (load - self.wheel_weight) / self.spring
 
 
-@dataclass(frozen=True)
+@settings
 class VehicleConfig:
     """The numbers of a vehicle, SI units, as a file in `configs/vehicles` holds them.
 
     Axes and fields are those of `Vehicle`; left and right are alike, pairs are front and rear.
     """
 
-    mass: float
+    mass: Positive
     """kg, wheels included."""
     centre_of_mass: tuple[float, float, float]
     """m in the body, whose origin lies between the wheel centres of the design position."""
-    inertia: tuple[float, float, float]
+    inertia: tuple[Positive, Positive, Positive]
     """kg m2, principal moments about the centre of mass."""
-    wheelbase: float
+    wheelbase: Positive
     """m between the axles."""
-    track: float
+    track: Positive
     """m between left and right wheels."""
-    wheel_radius: float
+    wheel_radius: Positive
     """m."""
-    wheel_width: float
+    wheel_width: Positive
     """m."""
-    wheel_inertia: float
+    wheel_inertia: Positive
     """kg m2 about the axle."""
-    wheel_weight: float
+    wheel_weight: Positive
     """N, what pulls an airborne wheel down."""
-    spring: tuple[float, float]
+    spring: tuple[Positive, Positive]
     """N/m at the wheel."""
-    damper: tuple[float, float]
+    damper: tuple[Positive, Positive]
     """N s/m at the wheel."""
     free_travel: tuple[float, float]
     """m, wheel height in the body at which the spring is relaxed."""
-    steering_limit: float
+    steering_limit: Positive
     """rad at the front wheels."""
-    steering_rate: float
+    steering_rate: Positive
     """rad/s at the front wheels."""
-    speed_gain: float
+    speed_gain: Positive
     """s/m, pedal per speed error; full pedal is 1."""
-    wheel_torque: float
+    wheel_torque: Positive
     """N m a wheel at full throttle."""
-    wheel_power: float
+    wheel_power: Positive
     """W a wheel at most."""
-    wheel_speed_limit: float
+    wheel_speed_limit: Positive
     """rad/s, mean wheel speed beyond which the engine gives nothing."""
-    brake_torque: float
+    brake_torque: Positive
     """N m a wheel at full braking."""
-    tyre_friction: float
+    tyre_friction: Positive
     """The tyre's own friction coefficient; contact takes the smaller one."""
     hull: tuple[float, float, float, float]
     """The chassis as a box, m: half its length, half its width, height of underside and roof."""
-    length: float
+    length: Positive
     """m, of the rectangle that collides with obstacles."""
-    width: float
+    width: Positive
     """m, of that rectangle."""
-    scale: float = 1.0
+    scale: Positive = 1.0
     """m at full size that 1 m of the vehicle is: about 10 for a 1/10-scale rover, so that it is as
     large as an HMMWV there."""
 
-    def __post_init__(self) -> None:
-        signed = ("centre_of_mass", "free_travel", "hull")
+    def check(self) -> None:
         for name, value in vars(self).items():
-            numbers = np.atleast_1d(value)
-            if not np.isfinite(numbers).all():
+            if not np.isfinite(value).all():
                 raise ValueError(f"{name}: expected finite numbers, found {value}")
-            if name not in signed and not (numbers > 0).all():
-                raise ValueError(f"{name}: expected > 0, found {value}")
         x, y, belly, roof = self.hull
         if not (x > 0 and y > 0 and belly < roof):
             raise ValueError(
@@ -163,41 +161,17 @@ class VehicleConfig:
 
     @property
     def vehicle(self) -> Vehicle:
-        """At full size, by Froude's similarity; NumPy float32 leaves, which start no device.
-
-        Lengths are `scale` times those of the vehicle, times and speeds its root: gravity, slopes,
-        friction and density stay as they are, so the motion is the same but for its scale.
-        """
-        metre, second = self.scale, self.scale**0.5
-        kilogram = metre**3
-        newton = kilogram * metre / second**2
+        """At full size, by Froude's similarity; NumPy float32 leaves, which start no device."""
         x, y = self.wheelbase / 2, self.track / 2
-        values = {
-            "mass": self.mass * kilogram,
-            "centre_of_mass": np.multiply(self.centre_of_mass, metre),
-            "inertia": np.multiply(self.inertia, kilogram * metre**2),
-            "wheel_position": np.multiply([(x, y), (x, -y), (-x, y), (-x, -y)], metre),
-            "wheel_radius": self.wheel_radius * metre,
-            "wheel_width": self.wheel_width * metre,
-            "wheel_inertia": self.wheel_inertia * kilogram * metre**2,
-            "wheel_weight": self.wheel_weight * newton,
-            "spring": np.repeat(self.spring, 2) * newton / metre,
-            "damper": np.repeat(self.damper, 2) * newton * second / metre,
-            "free_travel": np.repeat(self.free_travel, 2) * metre,
-            "steering_limit": self.steering_limit,
-            "steering_rate": self.steering_rate / second,
-            "speed_gain": self.speed_gain * second / metre,
-            "wheel_torque": self.wheel_torque * newton * metre,
-            "wheel_power": self.wheel_power * newton * metre / second,
-            "wheel_speed_limit": self.wheel_speed_limit / second,
-            "brake_torque": self.brake_torque * newton * metre,
-            "tyre_friction": self.tyre_friction,
-            "hull": np.multiply(_box(*self.hull), metre),
-            "length": self.length * metre,
-            "width": self.width * metre,
+        values: dict[str, Any] = dict(vars(self))
+        values |= {
+            "wheel_position": [(x, y), (x, -y), (-x, y), (-x, -y)],
+            "hull": _box(*self.hull),
+            **{name: np.repeat(values[name], 2) for name in ("spring", "damper", "free_travel")},
         }
-        arrays = {name: np.asarray(value, np.float32) for name, value in values.items()}
-        return Vehicle(**cast(dict[str, jax.Array], arrays))
+        arrays = {field.name: np.asarray(values[field.name], float) for field in fields(Vehicle)}
+        large = froude.scaled(Vehicle(**cast(dict[str, jax.Array], arrays)), self.scale)
+        return jax.tree.map(lambda x: np.asarray(x, np.float32), large)
 
 
 def load(name: str) -> VehicleConfig:

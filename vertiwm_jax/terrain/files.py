@@ -3,17 +3,16 @@
 import json
 import math
 import os
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from vertiwm_jax.terrain import soil
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
-from vertiwm_jax.terrain.map import ELEVATION_RANGE, MapError, TerrainMap, build, stack
+from vertiwm_jax.terrain.map import MapError, TerrainMap, build, stack
 from vertiwm_jax.terrain.soil import Soil
 
 # How Chrono calls our soil parameters, and how many of its units make one of ours.
@@ -26,6 +25,9 @@ _SOIL_FIELDS = {
     "Janosi_shear": ("shear_modulus", 1.0),
     "unit_weight": ("unit_weight", 1.0),
 }
+
+
+_NO_DATA = 42113  # GDAL's tag of the value that stands for none
 
 
 def load(path: str | Path) -> TerrainMap:
@@ -65,7 +67,6 @@ def save(terrain: TerrainMap, path: str | Path) -> None:
         "classes": terrain.class_names,
         "soil_fields": list(_SOIL_FIELDS),
         "soils": soils,
-        "elevation_range": np.asarray(terrain.elevation_range).tolist(),
     }
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -93,7 +94,6 @@ def from_heightmap(
     height_range: tuple[float, float] | None = None,
     class_image: str | Path | None = None,
     default_class: str = "grass",
-    elevation_range: tuple[float, float] = ELEVATION_RANGE,
     classes: GroundClasses = STANDARD,
 ) -> TerrainMap:
     """A map from heights in a 16-bit PNG, `.npy` or GeoTIFF file; row 0 is north.
@@ -128,7 +128,6 @@ def from_heightmap(
         heights,
         semantic,
         resolution=resolution,
-        elevation_range=elevation_range,
         classes=classes,
         name=name if class_image is None else f"{name} with {class_image}",
     )
@@ -139,8 +138,8 @@ def _load_world(path: Path) -> TerrainMap:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {field: file[field] for field in file.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise MapError(name, "file", "an .npz map", str(error)) from None
+    except Exception as error:  # Of zip files, of what they compress and of NumPy's headers.
+        raise MapError(name, "file", "an .npz map", _one_line(error)) from None
     wanted = ("elevation", "patch_class", "patch_friction", "obstacles", "class_rgb", "meta")
     for field in (*wanted, "resolution", "origin"):
         if field not in arrays:
@@ -149,20 +148,28 @@ def _load_world(path: Path) -> TerrainMap:
         if arrays[field].shape != shape:
             raise MapError(name, field, f"shape {shape}", f"{arrays[field].shape}")
     try:
-        meta = json.loads(str(arrays["meta"]))
+        return build(
+            arrays["elevation"],
+            arrays["patch_class"],
+            arrays["patch_friction"],
+            arrays["obstacles"],
+            resolution=float(arrays["resolution"]),
+            origin=tuple(arrays["origin"].tolist()),
+            classes=_classes(json.loads(str(arrays["meta"])), arrays["class_rgb"], name),
+            name=name,
+        )
+    except MapError:
+        raise
     except json.JSONDecodeError as error:
         raise MapError(name, "meta", "JSON text", str(error)) from None
-    return build(
-        arrays["elevation"],
-        arrays["patch_class"],
-        arrays["patch_friction"],
-        arrays["obstacles"],
-        resolution=float(arrays["resolution"]),
-        origin=tuple(arrays["origin"].tolist()),
-        elevation_range=tuple(meta.get("elevation_range", ELEVATION_RANGE)),
-        classes=_classes(meta, arrays["class_rgb"], name),
-        name=name,
-    )
+    except (TypeError, ValueError, AttributeError) as error:
+        raise MapError(
+            name, "file", "a map's fields", f"one ill-typed: {_one_line(error)}"
+        ) from None
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def _classes(meta: dict, rgb: np.ndarray, name: str) -> GroundClasses:
@@ -213,13 +220,19 @@ def _read_raster(path: Path, field: str) -> np.ndarray:
                     str(path), field, "the package tifffile to read GeoTIFF", "it is not installed",
                     "pip install 'vertiwm-jax[geotiff]'",
                 ) from None  # fmt: skip
-            return tifffile.imread(path)
+            with tifffile.TiffFile(path) as tiff:
+                page = tiff.pages.first
+                pixels, nothing = page.asarray(), page.tags.get(_NO_DATA) and page.nodata
+            if nothing is not None and (holes := np.sum(pixels == nothing)):
+                expected, found = "a value in every pixel", f"{holes} that are {nothing:g}, no data"
+                raise MapError(str(path), field, expected, found, "fill the holes")
+            return pixels
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB") if image.mode in ("P", "RGBA") else image)
     except MapError:
         raise
-    except (OSError, ValueError, UnidentifiedImageError) as error:
-        raise MapError(str(path), field, "a PNG, .npy or GeoTIFF file", str(error)) from None
+    except Exception as error:  # Of as many kinds as there are formats.
+        raise MapError(str(path), field, "a PNG, .npy or GeoTIFF file", _one_line(error)) from None
 
 
 def _read_classes(path: Path, classes: GroundClasses) -> np.ndarray:

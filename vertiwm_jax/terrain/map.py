@@ -16,16 +16,8 @@ from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.soil import Soil
 
-ELEVATION_RANGE = (0.0, 16.0)
-"""Metres mapped to [-1, 1] in elevation patches, one constant for all ground.
-
-Verti-Bench's scale (its highest maximum height is 16 m), which holds its worlds, the recorded
-Chrono drives and the procedural worlds, so that one encoder sees one scale everywhere.
-"""
-
-
 # What stacked worlds have in common.
-_SHARED = ("origin", "resolution", "elevation_range", "class_rgb", "deformable", "soils")
+_SHARED = ("origin", "resolution", "class_rgb", "deformable", "soils")
 
 
 class MapError(UserError, ValueError):
@@ -50,7 +42,6 @@ class TerrainMap:
     obstacles: `[W, N, 5]` centre x, y, size x, size y, height above ground, m; unused rows are 0.
     origin: `[2]` world x, y of vertex (0, 0), m.
     resolution: `[]` m between vertices.
-    elevation_range: `[2]` m, mapped to [-1, 1] in elevation patches.
     class_rgb: `[K, 3]` uint8 palette.
     deformable: `[K]` bool, whether a class is soil.
     soils: leaves `[K]`; rows of rigid classes are never used but finite.
@@ -66,7 +57,6 @@ class TerrainMap:
     obstacles: jax.Array
     origin: jax.Array
     resolution: jax.Array
-    elevation_range: jax.Array
     class_rgb: jax.Array
     deformable: jax.Array
     soils: Soil
@@ -93,7 +83,6 @@ def build(
     *,
     resolution: float = 1.0,
     origin: tuple[float, float] | None = None,
-    elevation_range: tuple[float, float] = ELEVATION_RANGE,
     classes: GroundClasses = STANDARD,
     name: str = "map",
 ) -> TerrainMap:
@@ -124,7 +113,6 @@ def build(
         obstacles=jnp.asarray(obstacles[None], jnp.float32),
         origin=jnp.asarray(origin, jnp.float32),
         resolution=jnp.float32(resolution),
-        elevation_range=jnp.asarray(elevation_range, jnp.float32),
         class_rgb=jnp.asarray(classes.rgb, jnp.uint8),
         deformable=jnp.asarray(classes.deformable),
         soils=classes.stacked_soils(),
@@ -174,25 +162,6 @@ def stack(maps: Sequence[TerrainMap], names: Sequence[str] | None = None) -> Ter
     )
 
 
-def enlarged(terrain: TerrainMap, scale: float, name: str = "map") -> TerrainMap:
-    """The ground that a vehicle `scale` times as large meets as one of the size given meets it.
-
-    Lengths are `scale` times as large, and soils as `soil.enlarged` has them; heights must still be
-    within `elevation_range`, which models know. Raises `MapError`, which calls the map `name`.
-    """
-    if scale == 1:
-        return terrain
-    larger = replace(
-        terrain,
-        elevation=scale * terrain.elevation,
-        obstacles=scale * terrain.obstacles,
-        origin=scale * terrain.origin,
-        resolution=scale * terrain.resolution,
-        soils=soil.enlarged(terrain.soils, scale),
-    )
-    return validate(larger, f"{name}, {scale:g} times as large")
-
-
 def validate(terrain: TerrainMap, name: str = "map") -> TerrainMap:
     """The same map if it can be used; `MapError` names `name`, the field and the place.
 
@@ -200,23 +169,18 @@ def validate(terrain: TerrainMap, name: str = "map") -> TerrainMap:
     """
     worlds, classes = terrain.elevation.shape[0], len(terrain.class_names)
     _check_shapes(terrain, worlds, classes, name)
-    resolution, origin, span = (
-        np.asarray(x) for x in (terrain.resolution, terrain.origin, terrain.elevation_range)
-    )
+    resolution, origin = np.asarray(terrain.resolution), np.asarray(terrain.origin)
     if not (np.isfinite(resolution) and resolution > 0):
         raise MapError(name, "resolution", "metres between vertices, > 0", f"{resolution}")
     if not np.isfinite(origin).all():
         raise MapError(name, "origin", "finite x, y", f"{origin}")
-    if not (np.isfinite(span).all() and span[0] < span[1]):
-        raise MapError(name, "elevation_range", "lowest < highest, m", f"{span}")
     if not 0 <= int(terrain.world) < worlds:
         raise MapError(name, "world", f"0 to {worlds - 1}", f"{int(terrain.world)}")
 
     elevation = np.asarray(terrain.elevation)
-    _check(np.isfinite(elevation), elevation, name, "elevation", "finite heights", "fill the holes")
-    inside = (elevation >= span[0]) & (elevation <= span[1])
-    expected = f"heights within elevation_range [{span[0]:g}, {span[1]:g}] m"
-    _check(inside, elevation, name, "elevation", expected, "pass a wider elevation_range")
+    # Of files, numbers such as -9999 stand for no height.
+    found, expected = (elevation > -1e3) & (elevation < 1e4), "heights of -1 to 10 km"
+    _check(found, elevation, name, "elevation", expected, "fill the holes")
 
     semantic, friction = np.asarray(terrain.semantic), np.asarray(terrain.friction)
     _check_ids(semantic, terrain.class_names, name)
@@ -268,7 +232,6 @@ def _check_shapes(terrain: TerrainMap, worlds: int, classes: int, name: str) -> 
         "obstacles": (worlds, None, 5),
         "origin": (2,),
         "resolution": (),
-        "elevation_range": (2,),
         "class_rgb": (classes, 3),
         "deformable": (classes,),
         "world": (),

@@ -78,23 +78,6 @@ def stack(soils: Sequence[Soil]) -> Soil:
     )
 
 
-def enlarged(soil: Soil, scale: float) -> Soil:
-    """The soil that a vehicle `scale` times as large meets as one of the size given meets `soil`.
-
-    By Froude's similarity: stresses, and so cohesion, are `scale` times as large, as depths are,
-    and density is the same; Bekker's moduli follow from sigma = (kc / b + kphi) z^n.
-    """
-    return Soil(
-        kc=soil.kc * scale ** (2 - soil.n),
-        kphi=soil.kphi * scale ** (1 - soil.n),
-        n=soil.n,
-        cohesion=soil.cohesion * scale,
-        friction_angle=soil.friction_angle,
-        shear_modulus=soil.shear_modulus * scale,
-        unit_weight=soil.unit_weight,
-    )
-
-
 def reece_moduli(
     k1: jax.Array | float, k2: jax.Array | float, n: jax.Array | float, width: jax.Array | float
 ) -> tuple[jax.Array | float, jax.Array | float]:

@@ -14,15 +14,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax import xla
+from vertiwm_jax import froude, xla
 from vertiwm_jax.terrain.classes import FIRST_DEFORMABLE, FRICTION_LIMITS, STANDARD
-from vertiwm_jax.terrain.map import ELEVATION_RANGE, TerrainMap
-from vertiwm_jax.terrain.soil import enlarged
+from vertiwm_jax.terrain.map import TerrainMap
 
 VERTICES = 129
 RESOLUTION = 1.0
 CELLS = 16
 HALF_EXTENT = 64.0
+HIGHEST = 16.0
+"""Height of the ground at most, m, which is that of Verti-Bench's worlds."""
 START_RADIUS = 60.0
 """Starts and goals lie on a circle of this radius about the centre, m."""
 START_CLEARANCE = 6.0
@@ -114,7 +115,7 @@ def labels(config: WorldConfig, count: int) -> list[tuple[Difficulty | float, Ki
 def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> TerrainMap:
     """Draws one world for each of the typed keys `[W]`, on the device; deterministic.
 
-    scale: of a small vehicle that is brought to full size, where soils are `soil.enlarged`: the
+    scale: of a small vehicle that is brought to full size, where soils are scaled: the
         worlds are as large as ever there, and so small to the vehicle itself.
     """
     drawn = labels(config, len(keys))
@@ -139,10 +140,9 @@ def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> Terrai
         obstacles=obstacles,
         origin=jnp.array([-HALF_EXTENT, HALF_EXTENT], jnp.float32),
         resolution=jnp.float32(RESOLUTION),
-        elevation_range=jnp.array(ELEVATION_RANGE, jnp.float32),
         class_rgb=jnp.asarray(STANDARD.rgb),
         deformable=jnp.asarray(STANDARD.deformable),
-        soils=enlarged(STANDARD.stacked_soils(), scale),
+        soils=froude.scaled(STANDARD.stacked_soils(), scale),
         world=jnp.int32(0),
         class_names=STANDARD.names,
     )
@@ -186,8 +186,8 @@ def _relief(key: jax.Array, slope_deg: jax.Array, config: ReliefConfig) -> jax.A
     slope = jnp.tan(jnp.deg2rad(slope_deg)) * between(1 - _SLOPE_SPREAD, 1 + _SLOPE_SPREAD)
     heights *= slope / _median_slope(heights)
     heights -= jnp.min(heights)
-    # Rarely, long steep hills would leave the range that elevation patches are scaled by.
-    return heights * jnp.minimum(1.0, ELEVATION_RANGE[1] / jnp.maximum(jnp.max(heights), 1e-6))
+    # Rarely, long steep hills would be higher than any of Verti-Bench.
+    return heights * jnp.minimum(1.0, HIGHEST / jnp.maximum(jnp.max(heights), 1e-6))
 
 
 def _noises(
