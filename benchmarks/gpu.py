@@ -40,8 +40,8 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import runs, training
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.suites import GroundConfig
-from vertiwm_jax.ppo import PPOTraining
-from vertiwm_jax.rl import task
+from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl.experiment import PPOTraining
 from vertiwm_jax.rl.loop import Seeds
 from vertiwm_jax.world_model.choice import ModelName
 
@@ -83,9 +83,9 @@ class Benchmark:
     end: float = 0.0
 
     @cached_property
-    def task(self) -> task.Task:
+    def task(self) -> experiment.Task:
         """What the training learns."""
-        return task.training_environment(self.config)[0]
+        return experiment.training_environment(self.config)[0]
 
     def driven(self, name: ModelName, vehicles: int) -> Job:
         """Rollouts of a model."""

@@ -12,8 +12,8 @@ from benchmarks._harness import parser, report
 from vertiwm_jax import config as configuration
 from vertiwm_jax import machine, parallel, training
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.ppo import PPOTraining
-from vertiwm_jax.rl import task
+from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl.experiment import PPOTraining
 from vertiwm_jax.rl.loop import Seeds
 
 _UNIT = 1 if sys.platform == "darwin" else 1024  # bytes, of `ru_maxrss`
@@ -36,9 +36,9 @@ def main() -> None:
     chosen = arguments.parse_args()
     results = {"imported": {"most_MB": most()}}
     config = configuration.load(PPOTraining, configuration.default_config(chosen.config))
-    terrain, pool, _ = task.training_ground(config)
+    terrain, pool, _ = experiment.training_ground(config)
     machine.forget_programs()
-    dynamics, weights = task.dynamics(config, config.model)
+    dynamics, weights = experiment.dynamics(config, config.model)
     env = NavigationEnv(dynamics, config.asked, config.variation)
     algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
     training.compiled(algorithm, env.shapes(weights, terrain, pool), batch)

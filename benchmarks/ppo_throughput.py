@@ -20,8 +20,8 @@ from benchmarks.models import PAPER, untrained
 from vertiwm_jax import config as configuration
 from vertiwm_jax import parallel
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
-from vertiwm_jax.ppo import PPOTraining
-from vertiwm_jax.rl import task
+from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl.experiment import PPOTraining
 from vertiwm_jax.rl.loop import Seeds
 from vertiwm_jax.rl.ppo import PPO
 from vertiwm_jax.world_model import model as world_model
@@ -72,7 +72,7 @@ def of_task(name: str, model: ModelName, weights: Path | None, operands: Operand
     file = configuration.default_config(name)
     config = configuration.load(PPOTraining, file)
     config = replace(config, model=model, weights=weights, operands=operands)
-    training, _ = task.training_environment(config)
+    training, _ = experiment.training_environment(config)
     return iteration(config.algorithm(training.env), training.params, config.action_repeat)
 
 

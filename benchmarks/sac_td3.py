@@ -9,17 +9,16 @@ from dataclasses import replace
 from benchmarks._harness import Figures, parser, report
 from benchmarks.ppo_throughput import iteration
 from vertiwm_jax import config as configuration
-from vertiwm_jax import evaluate
-from vertiwm_jax.rl import task
+from vertiwm_jax.rl import experiment
 from vertiwm_jax.world_model.choice import ModelName
 
 
 def of_task(name: str, model: ModelName) -> Figures:
     """An iteration of the default training by `sac` or `td3`, inside a model."""
-    config = evaluate.training(configuration.default_config(name))
+    config = experiment.load(configuration.default_config(name))
     soon = replace(getattr(config, name), warm_up=config.schedule.num_envs)
     config = replace(config, model=model, **{name: soon})
-    training, _ = task.training_environment(config)
+    training, _ = experiment.training_environment(config)
     return iteration(config.algorithm(training.env), training.params, config.action_repeat)
 
 

@@ -43,17 +43,17 @@ def phases(name: str) -> dict[str, dict[str, float]]:
     from vertiwm_jax import config as configuration
     from vertiwm_jax import machine, parallel, training
     from vertiwm_jax.env.navigation import NavigationEnv
-    from vertiwm_jax.ppo import PPOTraining
-    from vertiwm_jax.rl import task
+    from vertiwm_jax.rl import experiment
+    from vertiwm_jax.rl.experiment import PPOTraining
     from vertiwm_jax.rl.loop import Seeds
 
     lap("import")
     training.keep_compiled(None)  # in the folder of the environment
     config = configuration.load(PPOTraining, configuration.default_config(name))
-    terrain, pool, _ = jax.block_until_ready(task.training_ground(config))
+    terrain, pool, _ = jax.block_until_ready(experiment.training_ground(config))
     machine.forget_programs()
     lap("worlds")
-    dynamics, weights = task.dynamics(config, config.model)
+    dynamics, weights = experiment.dynamics(config, config.model)
     env = NavigationEnv(dynamics, config.asked, config.variation)
     algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
     training.compiled(algorithm, env.shapes(weights, terrain, pool), batch)

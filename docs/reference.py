@@ -16,15 +16,13 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 import vertiwm_jax
-from vertiwm_jax.collect import Collect
-from vertiwm_jax.compare import CompareConfig
-from vertiwm_jax.fit import FitConfig
+from vertiwm_jax.cli.collect import Collect
+from vertiwm_jax.cli.compare import CompareConfig
+from vertiwm_jax.cli.fit import FitConfig
+from vertiwm_jax.cli.make_logs import MakeLogs
 from vertiwm_jax.importers.settings import ImportSettings
-from vertiwm_jax.make_logs import MakeLogs
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
-from vertiwm_jax.ppo import PPOTraining
-from vertiwm_jax.sac import SACTraining
-from vertiwm_jax.td3 import TD3Training
+from vertiwm_jax.rl.experiment import PPOTraining, SACTraining, TD3Training
 
 COMMANDS = {
     "ppo": PPOTraining,

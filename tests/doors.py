@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -10,14 +11,19 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from vertiwm_jax import checkpoints
+from vertiwm_jax import checkpoints, cli
 from vertiwm_jax import config as configuration
-from vertiwm_jax.policy_training import TrainConfig
-from vertiwm_jax.rl import task
+from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl.experiment import TrainConfig
 from vertiwm_jax.rl.learned import MeanAction
 from vertiwm_jax.terrain import map as terrain_map
 
-Door = Callable[[Sequence[str] | None], None]
+Door = Callable[[Sequence[str]], None]
+
+
+def door(name: str) -> Door:
+    """The command as a function of its arguments."""
+    return partial(cli.main, name)
 
 
 @contextmanager
@@ -54,7 +60,7 @@ def untrained(kind: type[TrainConfig], run: Path) -> list[MeanAction]:
     """Policies of random weights, one a seed, left as a checkpoint beside `config.yaml`."""
     config = configuration.load(kind, run / "config.yaml")
     level = terrain_map.build(np.zeros((129, 129)), np.zeros((1, 1), int))
-    training = task.test_environment(config, level)
+    training = experiment.test_environment(config, level)
     algorithm = config.algorithm(training.env)
     keys = jax.random.split(jax.random.key(0), config.loop.seeds)
     shapes = jax.eval_shape(jax.vmap(algorithm.init, (None, 0)), training.params, keys)

@@ -166,13 +166,6 @@ def test_values_out_of_bounds_are_refused_in_python_and_in_files(tmp_path, value
         config.load(Joined, write(tmp_path, text))
 
 
-def test_values_out_of_bounds_are_refused_on_the_command_line(tmp_path, capsys):
-    for argv in (["--inner.count", "0"], ["--count", "0"]):
-        with pytest.raises(SystemExit):
-            config.parse(Joined, write(tmp_path, ""), argv, prog="door")
-        assert "count: expected at least 1, found 0" in capsys.readouterr().err
-
-
 def test_what_joins_fields_is_checked_after_bounds():
     with pytest.raises(ValueError, match="three times the rate at most, found 7"):
         Joined(count=7)
@@ -218,66 +211,6 @@ def test_numbers_of_numpy_are_saved_as_plain_ones():
     task = Task("x", np.int32(3), layers=(np.int64(8),), optimizer=Optimizer(np.float64(0.5)))
     plain = Task("x", 3, layers=(8,), optimizer=Optimizer(0.5))
     assert config.dump(task) == config.dump(plain)
-
-
-def test_the_command_line_overrides_the_file(tmp_path):
-    default = write(tmp_path, "name: x\nseed: 5\noptimizer: {clip: 2}")
-    other = tmp_path / "other.yaml"
-    other.write_text("name: y")
-    assert config.parse(Task, default, []) == Task("x", 5, optimizer=Optimizer(clip=2.0))
-    argv = ["--optimizer.learning-rate", "1e-2", "--layers", "1", "2", "--optimizer.clip", "None"]
-    argv += ["--optimizer.anneal", "False", "--suite", "mid"]
-    assert config.parse(Task, default, argv) == Task(
-        "x", 5, "mid", layers=(1, 2), optimizer=Optimizer(1e-2, None, False)
-    )
-    assert config.parse(Task, default, ["--seed", "7", "--config", str(other)]) == Task("y", 7)
-    assert config.parse(Task, default, [f"--config={other}"]) == Task("y")
-
-
-@pytest.mark.parametrize(
-    ("argv", "words"),
-    [
-        (["--config", "nowhere.yaml"], ["door: error:", "nowhere.yaml: no such file"]),
-        (["--sede", "3"], ["--sede", "--seed"]),
-        (["--seed", "many"], ["--seed", "many"]),
-        (["--optimizer.learning-rate", "-1"], ["learning_rate must be positive"]),
-    ],
-)
-def test_a_bad_command_line_ends_with_status_2(tmp_path, capsys, argv, words):
-    with pytest.raises(SystemExit) as stop:
-        config.parse(Task, write(tmp_path, "name: x"), argv, prog="door")
-    assert stop.value.code == 2
-    captured = capsys.readouterr()
-    text = captured.out + captured.err
-    for word in words:
-        assert word in text
-
-
-def test_only_verbose_tells_which_compiler_options_are_left_out(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(config.xla, "left_out", lambda: ["xla_of_another_version"])
-    default = write(tmp_path, "name: x")
-    assert config.parse(Task, default, []) == config.parse(Task, default, ["--verbose"])
-    assert capsys.readouterr().out == "compiler options left out: xla_of_another_version\n"
-
-
-def test_help_names_every_field(tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        config.parse(Task, write(tmp_path, "name: x\nseed: 41"), ["--help"], prog="door")
-    assert stop.value.code == 0
-    text = capsys.readouterr().out
-    options = [
-        "--config",
-        "--verbose",
-        "--name",
-        "--seed",
-        "--suite",
-        "--folder",
-        "--layers",
-        "--speeds",
-    ]
-    options += ["--optimizer.learning-rate", "--optimizer.clip", "--optimizer.anneal"]
-    for word in [*options, "Train something.", "Step size.", "41"]:
-        assert word in text
 
 
 def test_default_configs_are_found_by_name(tmp_path, monkeypatch):

@@ -4,12 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from vertiwm_jax import config, evaluate
-from vertiwm_jax.compare import CompareConfig
-from vertiwm_jax.fit import FitConfig
+from vertiwm_jax import config
+from vertiwm_jax.cli.compare import CompareConfig
+from vertiwm_jax.cli.fit import FitConfig
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
-from vertiwm_jax.ppo import PPOTraining
+from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl.experiment import PPOTraining
 from vertiwm_jax.world_model import model
 
 FOLDER = Path(__file__).parents[1] / "configs"
@@ -22,7 +23,7 @@ KINDS = {"table3": CompareConfig, "import_nedm": ImportSettings} | dict.fromkeys
 def test_every_one_can_be_read(file):
     folders = {"rows": FitConfig, "vehicles": VehicleConfig}
     kind = folders.get(file.parent.name, KINDS.get(file.stem))
-    loaded = config.load(kind, file) if kind else evaluate.training(file)
+    loaded = config.load(kind, file) if kind else experiment.load(file)
     assert kind or loaded.name in file.stem
 
 

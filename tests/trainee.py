@@ -12,10 +12,10 @@ from pathlib import Path
 import jax
 from rl.probes import ProbeParams, Target
 
+from vertiwm_jax import cli
 from vertiwm_jax.rl.loop import LoopConfig, restore, train
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.runs import Run
-from vertiwm_jax.training import failures_in_one_line
 
 STOPPED = 3
 """Iterations until the signal."""
@@ -58,5 +58,5 @@ def stop_by(number: int) -> None:
 def main() -> None:
     if sys.argv[3:] and jax.process_index() == jax.process_count() - 1:
         stop_by(int(sys.argv[3]))
-    with failures_in_one_line():
+    with cli.failures_in_one_line("ppo"), cli.told():
         print(trained(Path(sys.argv[1]), int(sys.argv[2])))

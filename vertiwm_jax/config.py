@@ -1,21 +1,18 @@
-"""Typed configuration: YAML files and the command line, read strictly into frozen dataclasses.
+"""Typed configuration: YAML files, read strictly into frozen dataclasses.
 
 Fields may be `bool`, `int`, `float`, `str`, `Path`, `Literal`, tuples, unions of these (so also
 optional ones) and nested dataclasses. Bounds are said in annotations, like `Positive`; `settings`
 makes a dataclass that checks them, whether it is made in Python, from YAML or by a command line.
 """
 
-import argparse
 import contextlib
 import dataclasses
 import difflib
 import functools
-import inspect
 import math
 import re
-import sys
 import types
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import (
     Annotated,
@@ -31,10 +28,8 @@ from typing import (
 )
 
 import numpy as np
-import tyro
 import yaml
 
-from vertiwm_jax import xla
 from vertiwm_jax.errors import UserError
 
 T = TypeVar("T")
@@ -53,29 +48,34 @@ class Bounds:
 
     low: float
     high: float = math.inf
-    open: bool = False
-    """Whether the bounds themselves are left out."""
+    above: bool = False
+    """Whether `low` itself is too low."""
+    below: bool = False
+    """Whether `high` itself is too high."""
 
     def __contains__(self, value: float) -> bool:
-        if not (self.low < value if self.open else self.low <= value):
+        if not (self.low < value if self.above else self.low <= value):
             return False
-        return self.high == math.inf or (value < self.high if self.open else value <= self.high)
+        return value < self.high if self.below else value <= self.high
 
     def __str__(self) -> str:
         low, high = f"{self.low:g}", f"{self.high:g}"
+        least = f"{'more than' if self.above else 'at least'} {low}"
         if self.high == math.inf:
-            return f"{'more than' if self.open else 'at least'} {low}"
-        return f"between {low} and {high}" if self.open else f"{low} to {high}"
+            return least
+        if self.above == self.below:
+            return f"between {low} and {high}" if self.above else f"{low} to {high}"
+        return f"{least} and {'below' if self.below else 'at most'} {high}"
 
 
 class AtLeastOne:
     """Says that a tuple may not be empty; for `Annotated`."""
 
 
-Positive = Annotated[float, Bounds(0, open=True)]
+Positive = Annotated[float, Bounds(0, above=True)]
 NotNegative = Annotated[float, Bounds(0)]
 Share = Annotated[float, Bounds(0, 1)]
-Discount = Annotated[float, Bounds(0, 1, open=True)]
+Discount = Annotated[float, Bounds(0, 1, above=True, below=True)]
 Count = Annotated[int, Bounds(1)]
 CountOrZero = Annotated[int, Bounds(0)]
 
@@ -85,8 +85,8 @@ def settings(cls: type[T]) -> type[T]:
     """A frozen dataclass whose values are checked whenever one is made.
 
     Numbers have to lie within the `Bounds` of their annotations. Then the method `check`, if there
-    is one, looks at what joins several fields. Values that are refused raise `ConfigError`, or what
-    `check` raises.
+    is one, looks at what joins several fields, and raises `ValueError`. Values that are refused
+    raise `ConfigError`.
     """
 
     def check_all(self: Any) -> None:
@@ -99,8 +99,12 @@ def settings(cls: type[T]) -> type[T]:
                 numbers = value if isinstance(value, tuple) else (value,)
                 if not all(number in bounds for number in numbers):
                     raise ConfigError(f"{name}: expected {bounds}, found {value}")
-        if hasattr(self, "check"):
-            self.check()
+        try:
+            getattr(self, "check", lambda: None)()
+        except ConfigError:
+            raise
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
 
     cls.__post_init__ = check_all  # pyright: ignore[reportAttributeAccessIssue]
     return dataclasses.dataclass(frozen=True)(cls)
@@ -133,6 +137,15 @@ def default_config(name: str) -> Path:
     inside, name = Path(name).parent, Path(name).name
     known = [path.stem for folder in _FOLDERS for path in sorted((folder / inside).glob("*.yaml"))]
     raise ConfigError(f"no configuration named {name!r}: expected {_choices(name, known)}")
+
+
+def find(path: str | Path) -> Path:
+    """The YAML file at `path`, or the one of that name that comes along: `ppo_small`.
+
+    An unknown name raises `ConfigError`.
+    """
+    path = Path(path)
+    return path if path.suffix or path.exists() else default_config(str(path))
 
 
 def load(cls: type[T], path: str | Path) -> T:
@@ -168,65 +181,6 @@ def dump(config: Any) -> str:
 def save(config: Any, path: str | Path) -> None:
     """Write a configuration to `path` as YAML, which `load` reads back equal."""
     Path(path).write_text(dump(config), encoding="utf-8")
-
-
-def parse(
-    cls: type[T],
-    default_file: str | Path,
-    argv: Sequence[str] | None = None,
-    prog: str | None = None,
-) -> T:
-    """Read a command line: `[--config FILE] [--any.field VALUE] [--verbose]`.
-
-    `--config` replaces `default_file`; every field can then be set by its dotted name, with
-    dashes or underscores. `argv` defaults to the process's arguments, `prog` to its name. Bad
-    input ends the process with status 2 and an error that names the file or option, as
-    `argparse` does.
-    """
-    argv = sys.argv[1:] if argv is None else argv
-    first = argparse.ArgumentParser(prog=prog, add_help=False, allow_abbrev=False)
-    first.add_argument("--config", type=Path, default=Path(default_file))
-    file = first.parse_known_args(argv)[0].config
-    try:
-        config = load(cls, file)
-    except ConfigError as error:
-        first.exit(2, f"{first.prog}: error: {error}\n")
-    file_help = "YAML file that gives the fields below their values."
-    verbose_help = "Say which options of the compiler are left out, as it does not know them."
-    # tyro sees these as options like others, so that the help shows them.
-    command_line = dataclasses.make_dataclass(
-        "CommandLine",
-        [
-            ("config", Annotated[Path, tyro.conf.arg(help=file_help)], file),
-            ("verbose", Annotated[bool, tyro.conf.arg(help=verbose_help)], False),
-            ("fields", tyro.conf.FlagConversionOff[Annotated[cls, tyro.conf.arg(name="")]], config),
-        ],
-    )
-    try:
-        given = tyro.cli(
-            command_line,
-            args=argv,
-            prog=prog,
-            description=inspect.getdoc(cls),
-            config=(tyro.conf.AvoidSubcommands, tyro.conf.FlagCreatePairsOff),
-        )
-    except ValueError as error:  # tyro lets through what the outermost dataclass refuses
-        first.exit(2, f"{first.prog}: error: {error}\n")
-    if given.verbose:
-        print(f"compiler options left out: {', '.join(xla.left_out()) or 'none'}", flush=True)
-    return given.fields
-
-
-def parse_resumable(cls: type[T], name: str, argv: Sequence[str] | None, program: str) -> T:
-    """`parse` with the file `name` that comes with the package, or that of the run to `--resume`.
-
-    cls: has a field `resume`, the folder of a run, or None.
-    """
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--resume", type=Path)
-    resume = first.parse_known_args(argv)[0].resume
-    file = resume / "config.yaml" if resume else default_config(name)
-    return parse(cls, file, argv, program)
 
 
 class _MismatchError(Exception):

@@ -2,9 +2,8 @@
 
 import contextlib
 import functools
-import re
+import logging
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -19,13 +18,12 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
 from vertiwm_jax import checkpoints, hosts, machine, parallel, xla
-from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import Count, settings
-from vertiwm_jax.errors import UserError
-from vertiwm_jax.runs import Run, RunError
-from vertiwm_jax.tracking import TrackingError
+from vertiwm_jax.errors import TrainingInterrupted, UserError
+from vertiwm_jax.runs import Run
 
 State = TypeVar("State")
+_log = logging.getLogger(__name__)
 
 
 class Algorithm(Protocol[State]):
@@ -65,33 +63,6 @@ class Work:
 
 class TrainingError(UserError):
     """Training cannot go on; the message says what is left to go on from."""
-
-
-class TrainingInterrupted(RuntimeError):
-    """The user stopped the training; the message says where it was saved."""
-
-
-@contextlib.contextmanager
-def failures_in_one_line(*expected: type[Exception]) -> Iterator[None]:
-    """Ends the command at failures of trainings and at those `expected`, with a status not 0."""
-    try:
-        yield
-    except TrainingInterrupted as stopped:
-        print(stopped)
-        sys.exit(130)
-    except KeyboardInterrupt:
-        print("stopped at once; go on from the newest checkpoint with --resume and the run folder")
-        hosts.leave(130)
-    except (RunError, CheckpointError, TrackingError, TrainingError, *expected) as error:
-        hosts.leave(f"error: {error}")
-    except (jax.errors.JaxRuntimeError, ValueError) as error:
-        # XLA raises either, beginning with a status like "UNKNOWN: ", where a connection breaks.
-        if jax.process_count() == 1 or not re.match("[A-Z_]+: ", str(error)):
-            raise
-        hosts.leave(
-            "error: another host has stopped or cannot be reached; go on from the newest "
-            f"checkpoint with --resume and the run folder: {str(error).splitlines()[0]}"
-        )
 
 
 def mean_in_turns(function: Callable[[Any], State], batches: Any) -> State:
@@ -217,14 +188,14 @@ def train(
 @functools.lru_cache(maxsize=1)
 def _compiled(algorithm: Algorithm[Any], mesh: Mesh, kind: Any, shapes: tuple[Any, ...]) -> Any:
     """For data and state of a kind of pytree with leaves of these shapes and types."""
-    print(f"compiling for {mesh.size} of {jax.device_count()} devices ...", flush=True)
+    _log.info("compiling for %d of %d devices ...", mesh.size, jax.device_count())
     start, place = time.perf_counter(), parallel.everywhere(mesh)
     leaves = [jax.ShapeDtypeStruct(*shape, sharding=place) for shape in shapes]
     iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=place)
     with jax.set_mesh(mesh):
         done = iterate.lower(*jax.tree.unflatten(kind, leaves)).compile()
     machine.release_memory()
-    print(f"compiled in {time.perf_counter() - start:.0f} s", flush=True)
+    _log.info("compiled in %.0f s", time.perf_counter() - start)
     return done
 
 
@@ -255,7 +226,7 @@ def _interruptible() -> Iterator[list[int]]:
     def note(number: int, frame: FrameType | None) -> None:
         seen.append(number)
         as_before()
-        print("\nstopping after this iteration; Ctrl-C again stops at once", flush=True)
+        _log.info("\nstopping after this iteration; Ctrl-C again stops at once")
 
     for number in before:
         signal.signal(number, note)

@@ -18,8 +18,8 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
-from vertiwm_jax.rl import task as task_of_learning
-from vertiwm_jax.rl.task import TaskConfig
+from vertiwm_jax.rl import experiment as task_of_learning
+from vertiwm_jax.rl.experiment import TaskConfig
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.world_model.choice import ModelName

@@ -7,7 +7,7 @@ import pytest
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.suites import GroundConfig
-from vertiwm_jax.rl.task import TaskConfig
+from vertiwm_jax.rl.experiment import TaskConfig
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
 

@@ -8,19 +8,20 @@ import multiprocessing
 import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax import collect, evaluate
+from vertiwm_jax import cli
+from vertiwm_jax.cli import collect, evaluate  # noqa: F401, before it forks
 
 
-def run(door: Callable[[Sequence[str]], None], argv: Sequence[str], ends: Connection) -> None:
+def run(name: str, argv: Sequence[str], ends: Connection) -> None:
     """Sends the one line that the command ends in."""
     try:
-        door(argv)
+        cli.main(name, argv)
         ends.send("")
     except SystemExit as stop:
         ends.send(str(stop.code))
@@ -29,13 +30,13 @@ def run(door: Callable[[Sequence[str]], None], argv: Sequence[str], ends: Connec
 def main(maps: str, output: str, seconds: float) -> None:
     jax.jit(jnp.sin)(jnp.zeros(3)).block_until_ready()
     commands = {
-        "collect": (collect.main, ["--output", output, "--worlds", maps, "--seconds", "0.1"]),
-        "evaluate": (evaluate.main, ["navigation", "--policy", "straight", "--worlds", maps]),
+        "collect": ["--output", output, "--worlds", maps, "--seconds", "0.1"],
+        "evaluate": ["navigation", "--policy", "straight", "--worlds", maps],
     }
     forking, waiting = multiprocessing.get_context("fork"), {}
-    for name, command in commands.items():
+    for name, argv in commands.items():
         ours, theirs = forking.Pipe(duplex=False)
-        process = forking.Process(target=run, args=(*command, theirs))
+        process = forking.Process(target=run, args=(name, argv, theirs))
         process.start()
         theirs.close()  # So that one that fails otherwise is not waited for.
         waiting[name] = process, ours

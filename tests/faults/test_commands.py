@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from doors import refusal
+from doors import door, refusal
 from faults.border import fault
 from learning import recordings
 
-from vertiwm_jax import evaluate, fit, policy_training, ppo, sac, td3
+from vertiwm_jax.cli import evaluate, fit
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.rl import experiment
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
 
@@ -52,16 +53,16 @@ def test_few_drives_are_split_by_share(tmp_path):
 def test_too_few_drives_are_refused_before_a_run_begins(tmp_path, monkeypatch):
     recordings.write(tmp_path, **recordings.drives(count=1))
     monkeypatch.setattr(fit.Run, "begin", begin)
-    assert str(tmp_path) in refusal(fit.main, "--data", tmp_path, "--runs", tmp_path / "runs")
+    assert str(tmp_path) in refusal(door("fit"), "--data", tmp_path, "--runs", tmp_path / "runs")
 
 
-@pytest.mark.parametrize("door", [ppo, sac, td3])
+@pytest.mark.parametrize("algorithm", ["ppo", "sac", "td3"])
 @pytest.mark.parametrize("name", ["file", "file/runs"])
 @fault(Begun, "that no run folder can be made is told when vehicles have been placed")
-def test_an_unwritable_run_folder_is_refused_first(tmp_path, monkeypatch, door, name):
+def test_an_unwritable_run_folder_is_refused_first(tmp_path, monkeypatch, algorithm, name):
     (tmp_path / "file").touch()
-    monkeypatch.setattr(policy_training.task, "training_ground", begin)
-    message = refusal(door.main, "--runs", tmp_path / name)
+    monkeypatch.setattr(experiment, "training_ground", begin)
+    message = refusal(door(algorithm), "--runs", tmp_path / name)
     assert f"{tmp_path / name}: cannot start a run there" in message
 
 
@@ -78,22 +79,22 @@ def test_an_unwritable_output_is_refused_first(tmp_path, monkeypatch, command):
         monkeypatch.setattr(place, name, begin)
     driven = {"navigation": ["--policy", "straight", "--worlds", maps(tmp_path / "large", 129)]}
     data = driven.get(command, ["--data", tmp_path])
-    message = refusal(evaluate.main, command, *data, "--output", tmp_path / "file")
+    message = refusal(door("evaluate"), command, *data, "--output", tmp_path / "file")
     assert str(tmp_path / "file") in message
 
 
 SMALL = {
-    "evaluate": (evaluate.main, ["navigation", "--policy", "straight"]),
-    "ppo": (ppo.main, ["--model", "builtin"]),
+    "evaluate": (door("evaluate"), ["navigation", "--policy", "straight"]),
+    "ppo": (door("ppo"), ["--model", "builtin"]),
 }
 
 
 @pytest.mark.parametrize("name", SMALL)
 @fault(AssertionError, "a map that is too small is told as tasks that cannot be driven")
 def test_a_map_that_is_too_small_is_called_so(tmp_path, name):
-    door, argv = SMALL[name]
+    command, argv = SMALL[name]
     small = maps(tmp_path / "worlds", size=21, count=5)
-    message = refusal(door, *argv, "--worlds", small).removeprefix("error: ")
+    message = refusal(command, *argv, "--worlds", small).removeprefix("error: ")
     # Its name and its size, and not the coordinates of a task.
     assert message.startswith(str(small)) and "20" in message.removeprefix(str(small))
     assert "tasks." not in message

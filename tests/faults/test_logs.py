@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from doors import refusal
+from doors import door, refusal
 from faults.border import fault
 from importers.bags import Bag
 from importers.logged import SETTINGS, logged, terrain
 from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.spatial.transform import Rotation
 
-from vertiwm_jax import config, import_drives
+from vertiwm_jax import config
 from vertiwm_jax.importers import rosbag
 from vertiwm_jax.importers.settings import Resampling, Table, Topics
 from vertiwm_jax.learning import dataset
@@ -71,7 +71,7 @@ def arguments(folder, source, output, settings=None):
 
 def imported(folder, source, output, settings=None):
     """The states of the drives that the command makes of a log."""
-    import_drives.main(arguments(folder, source, output, settings))
+    door("import_drives")(arguments(folder, source, output, settings))
     return np.asarray(dataset.load(output, "train")[0].state)
 
 
@@ -206,7 +206,7 @@ def test_attitudes_of_another_unit_or_frame_are_refused(folder, tmp_path, case):
     table, changed = WRONG_ATTITUDES[case]
     (tmp_path / "log.csv").write_text(text({"dawn": changed(ahead())}))
     argv = arguments(folder, tmp_path / "log.csv", tmp_path / "drives", of_attitudes(table))
-    assert str(tmp_path / "log.csv") in refusal(import_drives.main, *argv)
+    assert str(tmp_path / "log.csv") in refusal(door("import_drives"), *argv)
 
 
 @pytest.mark.parametrize("speed", [0.001, -0.001])

@@ -21,14 +21,14 @@ import numpy as np
 import optax
 from rl.probes import ProbeParams, Target
 
+from vertiwm_jax import cli, runs
 from vertiwm_jax import config as configuration
-from vertiwm_jax import ppo, runs
+from vertiwm_jax.cli.fit import FitConfig
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import Tasks
-from vertiwm_jax.fit import FitConfig
 from vertiwm_jax.learning import pipeline, stages
 from vertiwm_jax.learning.fitting import Fit, FitInputs, Problem, merge
 from vertiwm_jax.learning.stages import Inputs
@@ -302,7 +302,7 @@ def training(settings: str = TRAINING) -> Numbers:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "tiny.yaml")
         file.write_text(settings)
-        ppo.main(["--config", str(file), "--runs", folder])
+        cli.main("ppo", ["--config", str(file), "--runs", folder])
         (run,) = Path(folder).glob("ppo-*")
         metrics = runs.read_metrics(run)[0]
         with (run / "episodes.csv").open() as lines:

@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from doors import refusal
+from doors import door, refusal
 
-from vertiwm_jax import collect, evaluate, runs
+from vertiwm_jax import runs
+from vertiwm_jax.cli import collect
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env.observation import LAYOUT, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
@@ -44,7 +45,7 @@ def maps(tmp_path_factory):
 
 def run(maps, output, *argv):
     arguments = ["--output", output, "--worlds", maps, "--drives", 23, "--seconds", STEPS / 10]
-    collect.main([*map(str, arguments), *argv])
+    door("collect")([*map(str, arguments), *argv])
 
 
 @pytest.fixture(scope="module")
@@ -115,22 +116,22 @@ def test_what_cannot_be_written_leaves_nothing_half_written(maps, tmp_path, monk
 
     monkeypatch.setattr(runs, "write_atomic", write_on_a_full_disk)
     argv = ("--output", run_folder, "--worlds", maps, "--drives", 1, "--seconds", 0.1)
-    assert "No space left" in refusal(collect.main, *argv)
+    assert "No space left" in refusal(door("collect"), *argv)
     assert sorted(path.name for path in run_folder.iterdir()) == ["config.yaml", "maps"]
 
 
 def test_another_command_does_not_go_on(collected, maps, tmp_path):
     argv = ("--output", collected, "--worlds", maps, "--seconds", STEPS / 10)
-    message = refusal(collect.main, *argv, "--drives", 22)
+    message = refusal(door("collect"), *argv, "--drives", 22)
     assert message.endswith("config.yaml: drives: expected 23 as before, found 22")
     (tmp_path / "file").touch()
-    message = refusal(collect.main, "--output", tmp_path, "--worlds", maps)
+    message = refusal(door("collect"), "--output", tmp_path, "--worlds", maps)
     assert "expected a new folder" in message
     assert "none: file: expected" in refusal(
-        collect.main, "--output", tmp_path, "--worlds", maps / "none"
+        door("collect"), "--output", tmp_path, "--worlds", maps / "none"
     )
     with pytest.raises(SystemExit) as stop:
-        collect.main(["--output", str(tmp_path), "--obstacles", "True"])
+        door("collect")(["--output", str(tmp_path), "--obstacles", "True"])
     assert stop.value.code == 2
 
 
@@ -139,11 +140,11 @@ def test_chrono_that_is_missing_is_named(tmp_path, monkeypatch):
         raise ImportError(f"No module named {name!r}")
 
     monkeypatch.setattr(chrono.importlib, "import_module", missing)
-    message = refusal(collect.main, "--output", tmp_path / "drives", "--simulator", "chrono")
+    message = refusal(door("collect"), "--output", tmp_path / "drives", "--simulator", "chrono")
     assert "conda install -c projectchrono" in message and "PyPI is something else" in message
     assert not (tmp_path / "drives").exists()
     navigate = ("navigation", "--policy", "straight", "--simulator", "chrono")
-    assert refusal(evaluate.main, *navigate) == message
+    assert refusal(door("evaluate"), *navigate) == message
 
 
 def test_drives_that_end_early_are_tried_again(maps, monkeypatch):
@@ -292,11 +293,13 @@ def test_a_rover_drives_at_full_size(maps, tmp_path):
     assert meta["scale"] == 10
     resting = rover.wheel_radius - rover.travel_at_rest.mean()
     np.testing.assert_allclose(drives.state[..., 2] - 3.0, resting, atol=0.15)
-    message = refusal(collect.main, "--output", tmp_path / "drives", "--worlds", tmp_path / "maps")
+    message = refusal(
+        door("collect"), "--output", tmp_path / "drives", "--worlds", tmp_path / "maps"
+    )
     assert message.endswith("config.yaml: vehicle: expected rover as before, found hmmwv")
     for argv in (["--vehicle", "rovr"], ["--vehicle", "rover", "--simulator", "chrono"]):
         with pytest.raises(SystemExit) as stop:
-            collect.main(["--output", str(tmp_path / "other"), *argv])
+            door("collect")(["--output", str(tmp_path / "other"), *argv])
         assert stop.value.code
 
 

@@ -4,11 +4,12 @@ import shutil
 import sys
 
 import pytest
-from doors import opened, refusal
+from doors import door, opened, refusal
 
-from vertiwm_jax import compare, machine, runs
 from vertiwm_jax import config as configuration
-from vertiwm_jax.compare import CompareConfig, Row
+from vertiwm_jax import machine, runs
+from vertiwm_jax.cli import compare
+from vertiwm_jax.cli.compare import CompareConfig, Row
 
 SHARED = """
 ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 1}
@@ -29,7 +30,7 @@ def test_policies_are_trained_once_and_judged_together(tmp_path, monkeypatch):
     (tmp_path / "ppo.yaml").write_text(SHARED + PPO)
     (tmp_path / "table.yaml").write_text(TABLE)
     first = ["--config", str(tmp_path / "table.yaml"), "--settings", str(tmp_path)]
-    with opened(compare.main, tmp_path, *first) as table:
+    with opened(door("compare"), tmp_path, *first) as table:
         run = table()
         trainings = [*run.glob("ppo_in_*/ppo-*")]
         assert sorted(path.parent.name for path in trainings) == ["ppo_in_builtin", "ppo_in_nesam"]
@@ -70,13 +71,13 @@ def test_tables_without_sense_are_refused(tmp_path):
         CompareConfig(rows=(row, row))
     with pytest.raises(ValueError, match="jobs: expected at least 1, found 0"):
         CompareConfig(rows=(row,), jobs=0)
-    message = refusal(compare.main, "--settings", tmp_path / "none", "--runs", tmp_path / "runs")
+    message = refusal(door("compare"), "--settings", tmp_path / "none", "--runs", tmp_path / "runs")
     assert "ppo.yaml: no such file" in message
     assert not (tmp_path / "runs").exists()
 
 
 def test_chrono_is_asked_for_before_hours_of_training(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pychrono", None)
-    message = refusal(compare.main, "--simulators", "chrono", "--runs", tmp_path / "runs")
+    message = refusal(door("compare"), "--simulators", "chrono", "--runs", tmp_path / "runs")
     assert "expected PyChrono 9.0" in message
     assert not (tmp_path / "runs").exists()

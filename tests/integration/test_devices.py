@@ -129,14 +129,26 @@ def with_three_cores(program: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("before", "expected"),
     [
-        ("sys.argv[0] = '-m'", 3),  # as while Python looks for a command
-        ("sys.argv[0] = 'script.py'", 1),
-        ("from vertiwm_jax import machine, parallel; machine.use_cores(); machine.use_cores()", 3),
+        ("from vertiwm_jax import cli; cli.prepare('ppo')", 3),
+        ("sys.argv[0] = '-m'", 1),
+        ("from vertiwm_jax import machine; machine.use_cores(); machine.use_cores()", 3),
     ],
 )
 def test_commands_use_all_cores_and_scripts_what_they_ask_for(before, expected):
     found = with_three_cores(f"{before}\nimport vertiwm_jax.ppo, jax\nprint(jax.device_count())\n")
     assert int(found.stdout) == expected
+
+
+def test_to_import_the_package_changes_nothing():
+    program = """
+import gc
+before = gc.get_threshold(), dict(os.environ)
+import vertiwm_jax
+assert "jax" not in sys.modules
+assert (gc.get_threshold(), dict(os.environ)) == before
+"""
+    found = with_three_cores(program)
+    assert found.returncode == 0, found.stderr
 
 
 def test_to_ask_for_all_cores_too_late_is_an_error_that_says_what_to_do():

@@ -12,16 +12,17 @@ import chex
 import jax
 import numpy as np
 import pytest
-from doors import opened, refusal
+from doors import door, opened, refusal
 
-from vertiwm_jax import checkpoints, evaluate, export, machine, policy_training, ppo, runs, sac, td3
+from vertiwm_jax import checkpoints, machine, runs
 from vertiwm_jax import config as configuration
+from vertiwm_jax.cli import evaluate
 from vertiwm_jax.deploy import run_policy
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.ppo import PPOTraining
-from vertiwm_jax.rl import task
+from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl.experiment import PPOTraining
 from vertiwm_jax.rl.planning import PlanningConfig
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain import files
@@ -55,7 +56,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def train(folder):
     """Runs the door, with the tiny settings first; gives the newest run folder."""
-    with opened(ppo.main, folder, "--config", str(folder / "tiny.yaml")) as train:
+    with opened(door("ppo"), folder, "--config", str(folder / "tiny.yaml")) as train:
         yield train
 
 
@@ -72,8 +73,8 @@ def numbers(run):
 
 
 def learned(run):
-    config = evaluate.training(run / "config.yaml")
-    return policy_training.learned(config, task.held_out(config), run)
+    config = experiment.load(run / "config.yaml")
+    return experiment.learned(config, experiment.held_out(config), run)
 
 
 @pytest.mark.smoke
@@ -123,16 +124,15 @@ def test_resuming_is_as_if_never_stopped(run, train, monkeypatch):
     assert (stopped / "config.yaml").read_text() == (run / "config.yaml").read_text()
 
 
-@pytest.mark.parametrize("door", [sac, pytest.param(td3, marks=pytest.mark.slow)])
-def test_other_algorithms_leave_the_same_and_resume(door, folder, tmp_path):
-    name = door.__name__.split(".")[-1]
+@pytest.mark.parametrize("name", ["sac", pytest.param("td3", marks=pytest.mark.slow)])
+def test_other_algorithms_leave_the_same_and_resume(name, folder, tmp_path):
     settings = "{transitions: 192, num_envs: 8, num_steps: 8, updates: 1, batch: 8, capacity: 64, "
     settings += "warm_up: 64, hidden: [8]}"
     # Policies that also see the ground by the world model's encoders.
     tiny = TINY[: TINY.index("planning")].replace("settle_steps", "embeddings: true, settle_steps")
     tiny += f"{name}: {settings}\nloop: {{checkpoint_every: 2}}\n"
     (tmp_path / "tiny.yaml").write_text(tiny)
-    with opened(door.main, folder, "--config", str(tmp_path / "tiny.yaml")) as train:
+    with opened(door(name), folder, "--config", str(tmp_path / "tiny.yaml")) as train:
         run = train()
         assert run.name.startswith(name)
         assert [line["step"] for line in runs.read_metrics(run)] == [1, 2, 3]
@@ -141,11 +141,11 @@ def test_other_algorithms_leave_the_same_and_resume(door, folder, tmp_path):
         train("--resume", str(stopped))
     assert numbers(stopped) == numbers(run)
     chex.assert_trees_all_equal(learned(stopped), learned(run))
-    evaluate.main(["navigation", "--policy", str(run), "--output", str(tmp_path / "found")])
+    door("evaluate")(["navigation", "--policy", str(run), "--output", str(tmp_path / "found")])
     found = json.loads((tmp_path / "found" / "summary.json").read_text())
     assert found == json.loads((run / "summary.json").read_text())
     assert all(name in rows for rows in found.values())
-    export.main([str(run)])
+    door("export")([str(run)])
     robot = run_policy.load(run / "export")
     assert robot(np.zeros(OBSERVATION_SIZE + math.prod(EMBEDDING_SHAPE))).shape == (2,)
 
@@ -153,7 +153,7 @@ def test_other_algorithms_leave_the_same_and_resume(door, folder, tmp_path):
 def test_what_is_set_beside_resume_is_kept(run, train, tmp_path):
     again = shutil.copytree(run, tmp_path / "again")
     before = (again / "config.yaml").read_text()
-    message = refusal(ppo.main, "--resume", again, "--ppo.hidden", 16)
+    message = refusal(door("ppo"), "--resume", again, "--ppo.hidden", 16)
     assert "actor" in message and "16]" in message and "8]" in message
     assert (again / "config.yaml").read_text() == before
     train("--resume", str(again), "--ppo.transitions", "320")
@@ -175,7 +175,7 @@ def test_bad_settings_are_named(tmp_path, capsys, text, words):
     file = tmp_path / "bad.yaml"
     file.write_text(text)
     with pytest.raises(SystemExit) as stop:
-        ppo.main(["--config", str(file)])
+        door("ppo")(["--config", str(file)])
     assert stop.value.code == 2
     message = capsys.readouterr().err
     assert f"error: {file}: {words}" in message and message.count("\n") == 1
@@ -183,27 +183,27 @@ def test_bad_settings_are_named(tmp_path, capsys, text, words):
 
 def test_bad_worlds_are_named(folder, tmp_path):
     tiny = ("--config", folder / "tiny.yaml", "--runs", tmp_path / "runs")
-    assert "nowhere" in refusal(ppo.main, *tiny, "--worlds", tmp_path / "nowhere")
+    assert "nowhere" in refusal(door("ppo"), *tiny, "--worlds", tmp_path / "nowhere")
     maps(tmp_path / "maps", count=2)
-    message = refusal(ppo.main, *tiny, "--worlds", tmp_path / "maps")
+    message = refusal(door("ppo"), *tiny, "--worlds", tmp_path / "maps")
     assert "held_out_every: expected at most the 2 worlds found" in message
     (tmp_path / "maps" / "map_0.npz").write_bytes(b"no archive")
-    assert "map_0.npz" in refusal(ppo.main, *tiny, "--worlds", tmp_path / "maps")
+    assert "map_0.npz" in refusal(door("ppo"), *tiny, "--worlds", tmp_path / "maps")
     assert not (tmp_path / "runs").exists()
 
 
 def test_runs_that_cannot_be_are_named(run, folder, tmp_path):
     (tmp_path / "file").touch()
     tiny = ("--config", folder / "tiny.yaml")
-    message = refusal(ppo.main, *tiny, "--runs", tmp_path / "file")
+    message = refusal(door("ppo"), *tiny, "--runs", tmp_path / "file")
     assert "file: cannot start a run there" in message
     damaged = shutil.copytree(run, tmp_path / "damaged")
     (damaged / "metrics.jsonl").write_text("{broken\n")
-    assert "metrics.jsonl: line 1" in refusal(ppo.main, "--resume", damaged)
+    assert "metrics.jsonl: line 1" in refusal(door("ppo"), "--resume", damaged)
 
 
 def test_a_run_is_evaluated_as_at_its_end(run, tmp_path, capsys):
-    evaluate.main(["navigation", "--policy", str(run), "--output", str(tmp_path)])
+    door("evaluate")(["navigation", "--policy", str(run), "--output", str(tmp_path)])
     for name in ("summary.json", "episodes.csv"):
         assert (tmp_path / name).read_text() == (run / name).read_text()
     assert (run / "summary.md").read_text() in capsys.readouterr().out
@@ -212,25 +212,25 @@ def test_a_run_is_evaluated_as_at_its_end(run, tmp_path, capsys):
 def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch):
     navigate = ["navigation", "--policy"]
     maps(tmp_path / "maps", count=2)
-    evaluate.main([*navigate, str(run), "--worlds", str(tmp_path / "maps")])
+    door("evaluate")([*navigate, str(run), "--worlds", str(tmp_path / "maps")])
     said = capsys.readouterr().out
     assert "driving 4 tasks on 2 worlds" in said and "  straight to goal: " in said
     # The usual worlds are many.
     find = configuration.default_config
     found = {"ppo": run / "config.yaml"}
     monkeypatch.setattr(configuration, "default_config", lambda name: found.get(name) or find(name))
-    evaluate.main([*navigate, "straight", "--suites", "hard", "--seed", "7"])
+    door("evaluate")([*navigate, "straight", "--suites", "hard", "--seed", "7"])
     text = capsys.readouterr().out
     assert "**hard**" in text and "| straight to goal" in text
     assert "random" not in text and "Solved of" not in text
-    evaluate.main([*navigate, "random"])
+    door("evaluate")([*navigate, "random"])
     assert "| random" in capsys.readouterr().out
     small = ["--mppi.candidates", "2", "--mppi.decisions", "1", "--mppi.model", "builtin"]
-    evaluate.main([*navigate, "mppi", "--suites", "easy", *small])
+    door("evaluate")([*navigate, "mppi", "--suites", "easy", *small])
     assert "| mppi" in capsys.readouterr().out
     small = ["candidates", "2", "improved", "1", "steps", "1", "decisions", "1", "model", "bicycle"]
     options = [f"--shooting.{x}" if i % 2 == 0 else x for i, x in enumerate(small)]
-    evaluate.main([*navigate, "shooting", "--suites", "easy", *options])
+    door("evaluate")([*navigate, "shooting", "--suites", "easy", *options])
     assert "| shooting" in capsys.readouterr().out
 
 
@@ -243,7 +243,7 @@ def test_how_far_sensors_see_can_be_asked_for(tmp_path):
     sighted = replace(config, navigation=NavigationConfig(embeddings=True))
     configuration.save(sighted, tmp_path / "config.yaml")
     navigate = ("navigation", "--policy", tmp_path, "--reveal-range", "5")
-    assert "reveal.range: expected inf with embeddings" in refusal(evaluate.main, *navigate)
+    assert "reveal.range: expected inf with embeddings" in refusal(door("evaluate"), *navigate)
 
 
 class Driven(Exception):
@@ -264,7 +264,7 @@ def nothing_driven(monkeypatch):
 def test_a_policy_of_a_known_map_drives_on_one_that_is_revealed(run):
     navigate = ["navigation", "--policy", str(run), "--suites", "easy", "--reveal-range", "12"]
     with pytest.raises(Driven) as found:
-        evaluate.main(navigate)
+        door("evaluate")(navigate)
     env, params, policies, *_ = found.value.args
     assert env.config.reveal.range == 12.0 and params.starts.belief is not None
     assert any(name.startswith("ppo") for name in policies)
@@ -279,7 +279,7 @@ def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path):
         configuration.save(config, tmp_path / "config.yaml")
         asked = [] if planning is None else ["--planning", str(planning)]
         with pytest.raises(Driven) as found:
-            evaluate.main(["navigation", "--policy", str(tmp_path), *asked])
+            door("evaluate")(["navigation", "--policy", str(tmp_path), *asked])
         policies = found.value.args[2]
         plans = bool(of_run) if planning is None else planning
         assert ("ppo with planning" in policies) == plans and "ppo" in policies
@@ -292,12 +292,12 @@ def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path):
 
 def test_a_policy_drives_another_vehicle(run, tmp_path, capsys):
     navigate = ("navigation", "--policy", run, "--suites", "easy", "--output")
-    evaluate.main([*map(str, navigate), str(tmp_path / "hmmwv")])
-    evaluate.main([*map(str, navigate), str(tmp_path / "rover"), "--vehicle", "rover"])
+    door("evaluate")([*map(str, navigate), str(tmp_path / "hmmwv")])
+    door("evaluate")([*map(str, navigate), str(tmp_path / "rover"), "--vehicle", "rover"])
     assert "| straight to goal" in capsys.readouterr().out
     first, second = ((tmp_path / name / "episodes.csv").read_text() for name in ("hmmwv", "rover"))
     assert first != second
-    message = refusal(evaluate.main, *navigate, tmp_path / "rovr", "--vehicle", "rovr")
+    message = refusal(door("evaluate"), *navigate, tmp_path / "rovr", "--vehicle", "rovr")
     assert "did you mean 'rover'" in message
 
 
@@ -315,23 +315,23 @@ def test_training_inside_a_world_model_and_judged_in_the_simulator(
     # It goes on with what it began with, wherever that is.
     assert configuration.load(PPOTraining, run / "config.yaml").operands == "bfloat16"
     assert all(np.isfinite(line["policy_loss"]) for line in runs.read_metrics(run))
-    evaluate.main(["navigation", "--policy", str(run)])
+    door("evaluate")(["navigation", "--policy", str(run)])
     assert (run / "summary.md").read_text() in capsys.readouterr().out
-    message = refusal(ppo.main, "--model", "nesam", "--weights", tmp_path, "--runs", tmp_path)
+    message = refusal(door("ppo"), "--model", "nesam", "--weights", tmp_path, "--runs", tmp_path)
     assert "model.yaml: no such file" in message
 
 
 def test_policies_that_are_none_are_named(run, tmp_path):
     navigate = ("navigation", "--policy")
-    message = refusal(evaluate.main, *navigate, tmp_path / "none")
+    message = refusal(door("evaluate"), *navigate, tmp_path / "none")
     assert "none/config.yaml: no such file" in message
     shutil.copy(run / "config.yaml", tmp_path)
-    message = refusal(evaluate.main, *navigate, tmp_path)
+    message = refusal(door("evaluate"), *navigate, tmp_path)
     assert message.endswith("expected checkpoints of a training, found none")
     text = (run / "config.yaml").read_text().replace("hidden: [8]", "hidden: [4]")
     (tmp_path / "config.yaml").write_text(text)
     shutil.copytree(run / "checkpoints", tmp_path / "checkpoints")
-    assert "belongs to another configuration" in refusal(evaluate.main, *navigate, tmp_path)
+    assert "belongs to another configuration" in refusal(door("evaluate"), *navigate, tmp_path)
     newest = checkpoints.latest(run / "checkpoints")
     assert newest is not None and newest.name in ("4", "5")
 
@@ -340,7 +340,7 @@ def test_predictions_of_drives(tmp_path, capsys):
     drives(tmp_path, count=25, steps=24, speed=4.0)
     out = tmp_path / "tables"
     argv = ["prediction", "--data", str(tmp_path), "--context", "2", "--horizon", "4"]
-    evaluate.main([*argv, "--models", "builtin", "--output", str(out)])
+    door("evaluate")([*argv, "--models", "builtin", "--output", str(out)])
     assert "| constant velocity | 0.000 (0.000-0.000) | 0 |" in capsys.readouterr().out
     with (out / "prediction.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["measure"] == "position"]
@@ -352,38 +352,40 @@ def test_predictions_of_drives(tmp_path, capsys):
     assert "4-step yaw error, deg" in text and "ground under the vehicle" in text
     for picture in ("prediction.png", "paths.png"):
         assert (out / picture).stat().st_size > 10_000
-    evaluate.main([*argv, "--models", "builtin", "--vehicle", "rover", "--output", f"{out}-rover"])
+    door("evaluate")(
+        [*argv, "--models", "builtin", "--vehicle", "rover", "--output", f"{out}-rover"]
+    )
     with (tmp_path / "tables-rover" / "prediction.csv").open() as file:
         others = [row for row in csv.DictReader(file) if row["measure"] == "position"]
     assert [a["mean"] != b["mean"] for a, b in zip(rows, others, strict=True)] == [
         True, True, False,
     ]  # fmt: skip
-    assert "rovr" in refusal(evaluate.main, *argv, "--vehicle", "rovr")
+    assert "rovr" in refusal(door("evaluate"), *argv, "--vehicle", "rovr")
 
 
 def test_bad_drives_are_named(tmp_path, capsys):
     predict = ("prediction", "--models", "builtin", "--data", tmp_path)
-    assert "found none" in refusal(evaluate.main, *predict)
+    assert "found none" in refusal(door("evaluate"), *predict)
     drives(tmp_path, count=25, steps=24, speed=4.0)
-    assert "at least 32 steps, found at most 24" in refusal(evaluate.main, *predict)
+    assert "at least 32 steps, found at most 24" in refusal(door("evaluate"), *predict)
     drives(tmp_path, count=3, steps=24, speed=4.0)
-    assert "for the test split" in refusal(evaluate.main, *predict)
+    assert "for the test split" in refusal(door("evaluate"), *predict)
     drives(tmp_path, count=25, steps=24, speed=4000.0)
-    assert "drives.npz: state: expected" in refusal(evaluate.main, *predict)
+    assert "drives.npz: state: expected" in refusal(door("evaluate"), *predict)
     (tmp_path / "maps" / "map_0.npz").unlink()
     drives(tmp_path, count=25, steps=24, speed=4.0, with_map=False)
-    assert "map_0.npz was expected" in refusal(evaluate.main, *predict)
+    assert "map_0.npz was expected" in refusal(door("evaluate"), *predict)
     drives(tmp_path, count=25, steps=40, speed=4.0)
     adapt = ("adaptation", "--data", tmp_path)
-    assert "32 steps on soil alone, found none" in refusal(evaluate.main, *adapt)
+    assert "32 steps on soil alone, found none" in refusal(door("evaluate"), *adapt)
     capsys.readouterr()
     with pytest.raises(SystemExit) as stop:
-        evaluate.main(["adaptation", "--data", ".", "--wrong", "moon"])
+        door("evaluate")(["adaptation", "--data", ".", "--wrong", "moon"])
     assert stop.value.code == 2
     assert "wrong: expected one of mud, sand" in capsys.readouterr().err
     for argv in (["prediction"], ["predict"], ["prediction", "--data", ".", "--stride", "0"]):
         with pytest.raises(SystemExit) as stop:
-            evaluate.main(argv)
+            door("evaluate")(argv)
         assert stop.value.code == 2
     assert "stride: expected at least 1, found 0" in capsys.readouterr().err
 

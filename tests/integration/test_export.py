@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import onnxruntime
 import pytest
-from doors import refusal, untrained
+from doors import door, refusal, untrained
 from env.worlds import SNOW, bicycle_env, hills, task
 from flax import struct
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import export, runs
+from vertiwm_jax import runs
+from vertiwm_jax.cli import export
 from vertiwm_jax.deploy import onnx_graph, run_policy, stablehlo
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env import observation, route
@@ -23,9 +24,9 @@ from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZ
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.networks.policy import Actor, Senses, SquashedActor
+from vertiwm_jax.rl.experiment import SACTraining
 from vertiwm_jax.rl.learned import Corrected, MeanAction
 from vertiwm_jax.rl.normalise import RunningStatistics
-from vertiwm_jax.sac import SACTraining
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.reveal import RevealConfig
@@ -218,7 +219,7 @@ def run_and_policy(tmp_path_factory):
 def test_a_run_is_exported_as_it_is_evaluated(run_and_policy, tmp_path, capsys):
     run, policy = run_and_policy
     robot = tmp_path / "robot"
-    export.main([str(run), "--seed", "1", "--output", str(robot)])
+    door("export")([str(run), "--seed", "1", "--output", str(robot)])
     assert str(robot) in capsys.readouterr().out
     assert {path.name for path in robot.iterdir()} == {
         "policy.json", "policy.npz", "policy.onnx", "policy.stablehlo", "route.stablehlo",
@@ -228,21 +229,21 @@ def test_a_run_is_exported_as_it_is_evaluated(run_and_policy, tmp_path, capsys):
     np.testing.assert_allclose(in_numpy(seen[:64]), act(policy, seen[:64]), atol=1e-5)
     assert in_numpy.about["held_while_learning"] == 3
     assert in_numpy.about["action"]["standing"] == [-1.0, 0.0]
-    message = refusal(export.main, run, "--output", robot)
+    message = refusal(door("export"), run, "--output", robot)
     assert "robot: expected no such folder yet, found one" in message
 
 
 def test_what_cannot_be_exported_is_named_and_leaves_nothing(run_and_policy, tmp_path, monkeypatch):
     run, _ = run_and_policy
-    assert "none/config.yaml: no such file" in refusal(export.main, tmp_path / "none")
+    assert "none/config.yaml: no such file" in refusal(door("export"), tmp_path / "none")
     assert not (tmp_path / "none").exists()
-    assert "seed: expected 0 to 1, found 2" in refusal(export.main, run, "--seed", 2)
+    assert "seed: expected 0 to 1, found 2" in refusal(door("export"), run, "--seed", 2)
     (tmp_path / "config.yaml").write_text(TINY)
-    assert "expected checkpoints of a training" in refusal(export.main, tmp_path)
+    assert "expected checkpoints of a training" in refusal(door("export"), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
     monkeypatch.delitem(sys.modules, "vertiwm_jax.deploy.onnx_graph")
     monkeypatch.setitem(sys.modules, "onnx", None)
-    assert 'pip install "vertiwm-jax[export]"' in refusal(export.main, run)
+    assert 'pip install "vertiwm-jax[export]"' in refusal(door("export"), run)
     assert {path.name for path in run.iterdir()} == {"config.yaml", "checkpoints"}
 
 

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from doors import opened, refusal
+from doors import door, opened, refusal
 
-from vertiwm_jax import evaluate, fit, runs
+from vertiwm_jax import runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.learning import dataset
@@ -58,7 +58,7 @@ def folder(tmp_path_factory):
 def fitted(folder):
     """Runs the door; gives the newest run folder."""
     tiny, drives = folder / "tiny.yaml", folder / "drives"
-    with opened(fit.main, folder, "--config", str(tiny), "--data", str(drives)) as fitted:
+    with opened(door("fit"), folder, "--config", str(tiny), "--data", str(drives)) as fitted:
         yield fitted
 
 
@@ -151,7 +151,7 @@ def test_gates_are_added_to_specialists_that_stay_as_they_are(run, fitted, folde
     for one, other in itertools.combinations(gates, 2):
         pairs = zip(*map(jax.tree.leaves, (one.network, other.network)), strict=True)
         assert any(not np.array_equal(x, y) for x, y in pairs)
-    message = refusal(fit.main, "--config", folder / "tiny.yaml", "--start", further / "model")
+    message = refusal(door("fit"), "--config", folder / "tiny.yaml", "--start", further / "model")
     assert "gates=1" in message and "gates=2" in message
 
 
@@ -173,7 +173,7 @@ def test_a_fit_goes_on_from_a_model_with_more_drives(run, fitted, folder, tmp_pa
     inputs = [(place / "nesam_rollouts" / "inputs.txt").read_text() for place in (run, further)]
     assert ["driven.npz" in text for text in inputs] == [False, True]
     other = ("--config", folder / "tiny.yaml", "--model.coefficients", "scalar")
-    message = refusal(fit.main, *other, "--start", run / "model", "--runs", tmp_path / "runs")
+    message = refusal(door("fit"), *other, "--start", run / "model", "--runs", tmp_path / "runs")
     assert "coefficients='scalar'" in message and "coefficients='grouped'" in message
     assert not (tmp_path / "runs").exists()
 
@@ -186,7 +186,7 @@ def test_one_specialist_alone_is_fitted_and_compared(fitted, folder, tmp_path, c
     capsys.readouterr()
     command = ["prediction", "--data", str(folder / "drives" / "deformable")]
     command += ["--context", "2", "--horizon", "3", "--stride", "50", "--models", "builtin"]
-    evaluate.main([*command, "--compare", str(run)])
+    door("evaluate")([*command, "--compare", str(run)])
     printed = capsys.readouterr().out
     assert "| no_terrain: transformer | " in printed
     assert "the paper, 16 steps: deformable" in printed and "| 0.790 |" in printed
@@ -211,12 +211,12 @@ def test_models_without_sense_are_refused(settings, words):
 
 def test_what_cannot_be_fitted_is_named(run, folder, tmp_path, capsys):
     with pytest.raises(SystemExit, match="2"):
-        fit.main(["--model.encoders", "shared", "--nesam.learns-from", "rigid"])
+        door("fit")(["--model.encoders", "shared", "--nesam.learns-from", "rigid"])
     assert "model.encoders: expected own ones" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
-        fit.main(["--model.gates", "2", "--gate.rollouts.trainable", "gate.network", "nesam"])
+        door("fit")(["--model.gates", "2", "--gate.rollouts.trainable", "gate.network", "nesam"])
     assert "expected nothing but gates where there are 2" in capsys.readouterr().err
-    message = refusal(fit.main, "--data", tmp_path, "--runs", tmp_path / "runs")
+    message = refusal(door("fit"), "--data", tmp_path, "--runs", tmp_path / "runs")
     assert "expected files of drives, or folders of them named rigid" in message
     again = shutil.copytree(run, tmp_path / "again")
     config, params = model.load(again / "model")

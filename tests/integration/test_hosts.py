@@ -12,8 +12,9 @@ import chex
 import jax
 import pytest
 import trainee
+from doors import door
 
-from vertiwm_jax import checkpoints, ppo, runs
+from vertiwm_jax import checkpoints, runs
 
 ITERATIONS = trainee.STOPPED + 3
 TESTS = Path(__file__).parents[1]
@@ -114,7 +115,7 @@ def test_a_command_on_two_hosts_leaves_one_run_that_is_the_one_of_one_process(tm
     first, other = together("-m", "vertiwm_jax.ppo", *argv, tmp_path / "two")
     assert first[0] == other[0] == 0, first[2] + other[2]
     assert "all of it is in" in first[1] and "all of it" not in other[1]
-    ppo.main([*argv, str(tmp_path / "one")])
+    door("ppo")([*argv, str(tmp_path / "one")])
     [two], [one] = (list((tmp_path / name).iterdir()) for name in ("two", "one"))
     assert len(numbers(two)) == 2
     chex.assert_trees_all_close(numbers(two), numbers(one), rtol=2e-4, atol=2e-5)

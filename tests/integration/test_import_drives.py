@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from doors import refusal
+from doors import door, refusal
 from importers.bags import Bag
 from importers.logged import SETTINGS, VEHICLE, errors, logged, rms, terrain
 
-from vertiwm_jax import config, import_drives
+from vertiwm_jax import config
+from vertiwm_jax.cli import import_drives
 from vertiwm_jax.importers.settings import (
     Frames,
     GridMapSettings,
@@ -63,7 +64,7 @@ def arguments(folder, output, source="loops.csv", settings="settings.yaml"):
 
 
 def run(*argv):
-    import_drives.main([str(word) for word in argv])
+    door("import_drives")([str(word) for word in argv])
 
 
 def test_a_log_becomes_a_collection(folder, seen, tmp_path, capsys):
@@ -134,7 +135,7 @@ def test_velocities_of_another_frame_are_told_apart(folder, seen, tmp_path):
     named = replace(settings, table=replace(settings.table, velocity=("vx", "vy", "vz")))
     config.save(named, folder / "body.yaml")
     argv = (*arguments(folder, tmp_path / "drives", "world.csv", "body.yaml"), "--map")
-    message = refusal(import_drives.main, *argv, folder / "level.npz")
+    message = refusal(door("import_drives"), *argv, folder / "level.npz")
     assert "world.csv: velocity: expected to point where the positions go, found" in message
     config.save(replace(named, frames=Frames(velocity="world")), folder / "body.yaml")
     run(*argv, folder / "level.npz")
@@ -148,7 +149,7 @@ def test_refusals_are_one_line_and_leave_nothing(folder, seen, tmp_path):
     output, with_map = tmp_path / "drives", ("--map", folder / "level.npz")
 
     def message(*argv):
-        text = refusal(import_drives.main, *argv)
+        text = refusal(door("import_drives"), *argv)
         assert not output.exists() and not list(tmp_path.glob(".*"))
         return text
 
@@ -180,7 +181,7 @@ def test_refusals_are_one_line_and_leave_nothing(folder, seen, tmp_path):
     assert stop.value.code == 2
     output.mkdir()
     assert "expected no such folder yet" in refusal(
-        import_drives.main, *arguments(folder, output), *with_map
+        door("import_drives"), *arguments(folder, output), *with_map
     )
 
 

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from doors import refusal
+from doors import door, refusal
 from learning import recordings
 
-from vertiwm_jax import import_drives, make_logs
 from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.terrain import files
 
@@ -24,7 +23,7 @@ def recorded(tmp_path_factory):
 def test_logs_of_a_rover_are_imported_as_they_were_recorded(recorded, tmp_path, capsys):
     logs = tmp_path / "logs"
     argv = [str(recorded), "--output", str(logs), "--vehicle", "rover", *QUIET]
-    make_logs.main([*argv, "--noise.dropped", "0"])
+    door("make_logs")([*argv, "--noise.dropped", "0"])
     printed = capsys.readouterr().out.splitlines()
     # 25 drives of 4 s take 4 s over the root of ten each.
     assert printed[0].startswith("0.5 minutes of logs")
@@ -33,7 +32,7 @@ def test_logs_of_a_rover_are_imported_as_they_were_recorded(recorded, tmp_path, 
     known = files.load(next((recorded / "maps").glob("*.npz")))
     np.testing.assert_allclose(10 * small.resolution, known.resolution)
     words = command.split("vertiwm_jax.import_drives ")[1].replace("DRIVES", str(tmp_path))
-    import_drives.main(words.split())
+    door("import_drives")(words.split())
     found, terrain = dataset.load(tmp_path / words.split("/")[-1], "train")
     before, ground = dataset.load(recorded, "train")
     np.testing.assert_allclose(terrain.elevation, ground.elevation, rtol=1e-5)
@@ -49,8 +48,10 @@ def test_logs_of_a_rover_are_imported_as_they_were_recorded(recorded, tmp_path, 
 def test_what_cannot_be_logged_is_named(recorded, tmp_path):
     (tmp_path / "none").mkdir()
     other = ("--output", tmp_path / "logs")
-    assert "expected .npz files" in refusal(make_logs.main, tmp_path / "none", *other)
-    message = refusal(make_logs.main, recorded, *other, "--vehicle", "rovr")
+    assert "expected .npz files" in refusal(door("make_logs"), tmp_path / "none", *other)
+    message = refusal(door("make_logs"), recorded, *other, "--vehicle", "rovr")
     assert "did you mean 'rover'" in message
     assert not (tmp_path / "logs").exists()
-    assert "expected no such folder yet" in refusal(make_logs.main, recorded, "--output", recorded)
+    assert "expected no such folder yet" in refusal(
+        door("make_logs"), recorded, "--output", recorded
+    )

@@ -5,14 +5,14 @@ import sys
 
 import numpy as np
 import pytest
-from doors import refusal, untrained
+from doors import door, refusal, untrained
 from learning import recordings
 from PIL import Image
 from viewing.test_recording import read
 
-from vertiwm_jax import view
+from vertiwm_jax.cli import view
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity
-from vertiwm_jax.sac import SACTraining
+from vertiwm_jax.rl.experiment import SACTraining
 
 TINY = """
 ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 2}
@@ -33,7 +33,7 @@ def uniform(monkeypatch):
 def test_a_recorded_drive(uniform, tmp_path, capsys, monkeypatch):
     path = recordings.write(tmp_path)
     argv = [str(path), "--drive", "4"]
-    view.main(argv)
+    door("view")(argv)
     recording, said = tmp_path / "a-drive-4.rrd", capsys.readouterr().out
     assert "a, drive 4, and vertiwm" in said and said.endswith(f"look at it:\nrerun {recording}\n")
     vehicle = read(recording)[0]["world/vehicle"]
@@ -42,10 +42,10 @@ def test_a_recorded_drive(uniform, tmp_path, capsys, monkeypatch):
     opened = []
     monkeypatch.setattr(subprocess, "call", lambda argv: opened.append(argv) or 3)
     other = tmp_path / "other.rrd"
-    message = refusal(view.main, *argv, "--output", other, "--open")
+    message = refusal(door("view"), *argv, "--output", other, "--open")
     assert opened[0][1:] == ["-m", "rerun", str(other)] and other.is_file()
     assert message.endswith("other.rrd: the rerun viewer ended with status 3")
-    view.main([*argv, "--movie", str(tmp_path / "a.gif")])
+    door("view")([*argv, "--movie", str(tmp_path / "a.gif")])
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames == recordings.STEPS / 2 + 1
     names = {"a.npz", "maps", "a-drive-4.rrd", "other.rrd", "a.gif"}
@@ -57,7 +57,7 @@ def test_another_vehicle_is_shown_as_large_as_it_is(uniform, tmp_path):
     for name, wheelbase in ((None, 3.302), ("rover", 3.12)):
         scene = view._recorded(view.View(path, vehicle=name))
         np.testing.assert_allclose(scene.vehicle.wheelbase, wheelbase, rtol=1e-5)
-    assert "did you mean 'rover'" in refusal(view.main, path, "--vehicle", "rovr")
+    assert "did you mean 'rover'" in refusal(door("view"), path, "--vehicle", "rovr")
 
 
 @pytest.mark.slow
@@ -65,39 +65,39 @@ def test_a_policy_on_a_held_out_task(tmp_path, capsys):
     (tmp_path / "config.yaml").write_text(TINY)
     untrained(SACTraining, tmp_path)
     argv = [str(tmp_path), "--model", "builtin", "--suite", "obstacles", "--seed", "1"]
-    view.main([*argv, "--task", "1"])
+    door("view")([*argv, "--task", "1"])
     assert "sac, seed 1 in builtin: timed out, 2.0 s" in capsys.readouterr().out
     entities, _ = read(tmp_path / "obstacles-1-builtin.rrd")
     assert entities["world/vehicle"]["step"] == list(range(21))
     assert {"world/goal", "world/obstacles"} <= set(entities)
     assert any("sinkage" in entity for entity in entities)
-    assert "task: expected 0 to 1, found 2" in refusal(view.main, *argv, "--task", 2)
-    assert "drive: is of a file" in refusal(view.main, *argv, "--drive", 0)
+    assert "task: expected 0 to 1, found 2" in refusal(door("view"), *argv, "--task", 2)
+    assert "drive: is of a file" in refusal(door("view"), *argv, "--drive", 0)
     (tmp_path / "checkpoints" / "1").rename(tmp_path / "gone")
-    assert "expected checkpoints of a training" in refusal(view.main, *argv)
+    assert "expected checkpoints of a training" in refusal(door("view"), *argv)
 
 
 def test_without_rerun(tmp_path, monkeypatch):
     path = recordings.write(tmp_path)
     monkeypatch.delitem(sys.modules, "vertiwm_jax.viewing.recording", raising=False)
     monkeypatch.setitem(sys.modules, "rerun", None)
-    message = refusal(view.main, path)
+    message = refusal(door("view"), path)
     assert "drive-0.rrd: expected" in message and '"vertiwm-jax[view]"' in message
 
 
 def test_what_cannot_be_shown_is_named(uniform, tmp_path, capsys):
     path = recordings.write(tmp_path)
     before = {path.name for path in tmp_path.iterdir()}
-    assert "a.npz: suite: is of a policy" in refusal(view.main, path, "--suite", "easy")
-    assert "drive: expected 0 to 24, found 99" in refusal(view.main, path, "--drive", 99)
-    assert "none.npz: " in refusal(view.main, tmp_path / "none.npz")
-    assert "maps/config.yaml: no such file" in refusal(view.main, tmp_path / "maps")
+    assert "a.npz: suite: is of a policy" in refusal(door("view"), path, "--suite", "easy")
+    assert "drive: expected 0 to 24, found 99" in refusal(door("view"), path, "--drive", 99)
+    assert "none.npz: " in refusal(door("view"), tmp_path / "none.npz")
+    assert "maps/config.yaml: no such file" in refusal(door("view"), tmp_path / "maps")
     nowhere = tmp_path / "none" / "a.rrd"
-    assert "none/a.rrd: cannot write" in refusal(view.main, path, "--output", nowhere)
+    assert "none/a.rrd: cannot write" in refusal(door("view"), path, "--output", nowhere)
     assert {path.name for path in tmp_path.iterdir()} == before
     for options in (["--movie", "a.avi"], ["--movie", "a.gif", "--open"]):
         with pytest.raises(SystemExit) as stop:
-            view.main([str(path), *options])
+            door("view")([str(path), *options])
         assert stop.value.code == 2
     found = capsys.readouterr().err
     assert "expected the ending .gif or .mp4, found .avi" in found and "leave out output" in found

@@ -4,16 +4,17 @@ A buffered extended Kalman filter: what a vehicle did in the last seconds is pre
 from where it was, with the soils believed now, and where it really went corrects them.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax.scipy.special import logit
 
 from vertiwm_jax.adaptation import kalman
 from vertiwm_jax.adaptation.kalman import Gaussian
+from vertiwm_jax.config import Bounds, Count, CountOrZero, Positive, settings
 from vertiwm_jax.dynamics import Dynamics, History, Params
 from vertiwm_jax.networks import soil_predictor
 from vertiwm_jax.state import Command, VehicleState
@@ -49,7 +50,7 @@ class SoilBelief:
     refused: jax.Array
 
 
-@dataclass(frozen=True)
+@settings
 class SoilFilter:
     """Estimates the six parameters of `BOUNDS` of each class of soil from how the vehicle moves.
 
@@ -58,33 +59,30 @@ class SoilFilter:
     not measured for long returns to what the map says.
     """
 
-    context: int = 8
+    context: CountOrZero = 8
     """Recorded steps that the model sees first, C."""
-    horizon: int = 8
+    horizon: Count = 8
     """Steps that it then predicts, H."""
-    prior: float = 1.5
+    prior: Positive = 1.5
     """Standard deviation of what the map says, in logits."""
-    memory: float = 0.98
+    memory: Annotated[float, Bounds(0, 1, above=True)] = 0.98
     """Share of a deviation from the map that a measurement leaves to the next one; the rest is
     forgotten, and what is known grows uncertain in step."""
-    noise: tuple[float, float, float, float, float, float] = (0.05, 0.05, 0.02, 0.02, 0.02, 0.02)
+    noise: Annotated[tuple[float, float, float, float, float, float], Bounds(0, above=True)] = (
+        0.05,
+        0.05,
+        0.02,
+        0.02,
+        0.02,
+        0.02,
+    )
     """Standard deviations of what the model misses in H steps with the right soil: ahead, to the
     left and up, m, and about these axes, rad."""
-    gate: float = 22.5
+    gate: Positive = 22.5
     """Largest squared Mahalanobis distance of a measurement that counts; 22.5 is 99.9 % of
     chi-square with six degrees of freedom."""
-    iterations: int = 3
+    iterations: Count = 3
     """Gauss-Newton steps of a measurement; 1 is the extended filter."""
-
-    def __post_init__(self):
-        for name, least in (("context", 0), ("horizon", 1), ("iterations", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected at least {least}, found {getattr(self, name)}")
-        for name in ("prior", "noise", "gate"):
-            if not np.min(getattr(self, name)) > 0:
-                raise ValueError(f"{name}: expected above 0, found {getattr(self, name)}")
-        if not 0 < self.memory <= 1:
-            raise ValueError(f"memory: expected above 0 and at most 1, found {self.memory}")
 
     def init(self, terrain: TerrainMap, state: VehicleState) -> SoilBelief:
         """The soils of the map, at the start of a drive."""

@@ -11,12 +11,13 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from vertiwm_jax.config import settings
 from vertiwm_jax.terrain.map import TerrainMap
 
 _STRENGTH = "kc", "kphi", "cohesion"
 
 
-@dataclasses.dataclass(frozen=True)
+@settings
 class RandomizationConfig:
     """Least and most of what each episode draws evenly; nothing varies by default."""
 
@@ -27,7 +28,7 @@ class RandomizationConfig:
     delay: tuple[int, int] = (0, 0)
     """Steps of 0.1 s that commands come late."""
 
-    def __post_init__(self):
+    def check(self):
         for name, least in (("grip", 0.01), ("soil", 0.01), ("delay", 0)):
             low, high = getattr(self, name)
             if not least <= low <= high:

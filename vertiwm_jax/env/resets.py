@@ -13,7 +13,7 @@ from vertiwm_jax.env import route, tasks
 from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
 from vertiwm_jax.env.route import Routes
 from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState, see
-from vertiwm_jax.env.tasks import Tasks
+from vertiwm_jax.env.tasks import TaskError, Tasks
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query, reveal
 from vertiwm_jax.terrain.map import TerrainMap
@@ -49,7 +49,7 @@ class ResetPool:
         finite = np.all(np.isfinite(states.vehicle.vector), axis=-1)
         if not finite.all():
             i = int(np.argmin(finite))
-            raise ValueError(
+            raise TaskError(
                 f"dynamics: expected a finite state after {config.settle_steps} steps of standing "
                 f"still, found {np.asarray(states.vehicle.vector)[i]} in task {i} (world "
                 f"{int(pool.world[i])}, start {np.asarray(pool.start)[i].tolist()}); "

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax import froude
-from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, NotNegative, settings
+from vertiwm_jax.config import AtLeastOne, ConfigError, Count, CountOrZero, NotNegative, settings
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.tasks import Tasks, circle_tasks, random_tasks
 from vertiwm_jax.terrain import files, vertibench, worlds
@@ -63,7 +63,7 @@ def grounds(
         return training, suite_worlds(config, key, scale)
     terrain = load(config, path, scale)
     if terrain.worlds < config.held_out_every:
-        raise ValueError(
+        raise ConfigError(
             f"{path}: held_out_every: expected at most the {terrain.worlds} worlds found, "
             f"is {config.held_out_every}"
         )

@@ -8,6 +8,7 @@ import numpy as np
 from flax import struct
 from gymnax.environments import environment
 
+from vertiwm_jax.config import settings
 from vertiwm_jax.dynamics import (
     History,
     Params,
@@ -24,7 +25,7 @@ from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.reveal import RevealConfig
 
 
-@dataclasses.dataclass(frozen=True)
+@settings
 class NavigationConfig:
     """What the task asks, static.
 
@@ -59,7 +60,7 @@ class NavigationConfig:
     route: RouteConfig = RouteConfig()
     reveal: RevealConfig = RevealConfig()
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         if self.reveal.partial and self.embeddings:
             raise ValueError(
                 "reveal.range: expected inf with embeddings, which show all of the map, "

@@ -12,6 +12,7 @@ from flax import struct
 from vertiwm_jax import xla
 from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.termination import edge_distance
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.geometry import wrap
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.state import VehicleState
@@ -21,6 +22,10 @@ from vertiwm_jax.terrain.map import TerrainMap
 _SURROUNDINGS = 4.0  # m
 _SWAYS = 13  # places that a pair of the circle may turn to
 _DRAWN_TOGETHER = 16  # random tasks
+
+
+class TaskError(UserError, ValueError):
+    """Tasks that cannot be driven, or found, on the map; the message says why."""
 
 
 @struct.dataclass
@@ -73,7 +78,7 @@ def circle_tasks(
     rows, columns = terrain.elevation.shape[-2:]
     half = np.array([columns - 1, rows - 1]) * float(terrain.resolution) / 2
     if radius >= half.min():
-        raise ValueError(
+        raise TaskError(
             f"circle_tasks: radius {radius:g} m does not fit on a map of "
             f"{2 * half[0]:g} x {2 * half[1]:g} m; choose one below {half.min():g} m"
         )
@@ -130,7 +135,7 @@ def random_tasks(
     missing = int(count - found.sum())
     if missing:
         worlds = np.unique(np.asarray(tasks.world)[~np.asarray(found)])
-        raise ValueError(
+        raise TaskError(
             f"random_tasks: no acceptable start and goal among {config.candidates} candidates "
             f"for {missing} of {count} tasks, on worlds {worlds[:8].tolist()}; allow a steeper "
             "start, a shorter distance, less clearance or more candidates"
@@ -215,7 +220,7 @@ def validate(tasks: Tasks, terrain: TerrainMap, goal_radius: float, margin: floa
     for message, bad in checks.items():
         if bad.any():
             i = int(np.argmax(bad))
-            raise ValueError(
+            raise TaskError(
                 f"tasks.{message}; task {i} has world {world[i]}, "
                 f"start {np.asarray(tasks.start)[i].tolist()}, "
                 f"goal {np.asarray(tasks.goal)[i].tolist()}, yaw {float(tasks.yaw[i]):g}"

@@ -21,6 +21,7 @@ from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.evaluation.plots import line, sheet, style
 from vertiwm_jax.evaluation.prediction import BATCH, TestWindows
 from vertiwm_jax.learning.rollouts import open_loop
+from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -86,12 +87,12 @@ def signs(
 
     Disagreement is that of the "gates", if there are several, and of the "specialists", the most
     telling first, summed over the predicted steps; the history of the model has to hold both, as
-    Verti-WM's does. `ValueError` if a prediction is not finite.
+    Verti-WM's does. `DataError` if a prediction is not finite.
     """
     last, apart, spread = map(np.asarray, _rolled(model, params, test.terrain, test.windows))
     error = np.linalg.norm(last - np.asarray(test.windows.state[:, -1, :3]), axis=-1)
     if lost := int(np.sum(~np.isfinite(error))):
-        raise ValueError(f"expected finite predictions, found {lost} of {len(error)} that are not")
+        raise DataError(f"expected finite predictions, found {lost} of {len(error)} that are not")
     several = {"gates": spread} if np.any(spread) else {}
     return error, several | {"specialists": apart}
 

@@ -19,8 +19,8 @@ from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.evaluation.navigation import NavigationResult
 from vertiwm_jax.evaluation.report import Judge
 from vertiwm_jax.mechanics.vehicle import HMMWV
-from vertiwm_jax.rl import task
-from vertiwm_jax.rl.task import Task, TaskConfig
+from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl.experiment import Task, TaskConfig
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.simulators import chrono, following
 from vertiwm_jax.simulators.chrono import Chrono
@@ -43,7 +43,7 @@ def expect(arena: Arena, config: TaskConfig) -> None:
 
 def test_in(arena: Arena, config: TaskConfig, terrain: TerrainMap) -> Task:
     """The test on these worlds."""
-    return task.test_environment(config, terrain, "builtin" if arena == "chrono" else arena)
+    return experiment.test_environment(config, terrain, "builtin" if arena == "chrono" else arena)
 
 
 def judge_in(arena: Arena, config: TaskConfig, terrain: TerrainMap, mapped: Map) -> Judge:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import logging
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -11,9 +12,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from vertiwm_jax import runs
+from vertiwm_jax import machine, runs
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Agent, Policy
+from vertiwm_jax.env.controllers import REFERENCE, baselines
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import TaskParams
 from vertiwm_jax.env.termination import TerminationReason
@@ -24,11 +26,43 @@ from vertiwm_jax.evaluation.navigation import (
     evaluate,
     format_table,
 )
+from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl.experiment import Trained
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.map import TerrainMap
 
 Results = Mapping[str, NavigationResult]
 Judge = Callable[[NavigationEnv, TaskParams, Policy | Agent, jax.Array], NavigationResult]
+
+CURVES = {
+    "episode_return": "return",
+    "success": "success",
+    "episode_length": "episode [steps]",
+    "entropy": "entropy [nats]",
+    "value_loss": "value loss",
+    "kl": "KL divergence",
+    "explained_variance": "explained variance",
+}
+"""What is drawn of a training, where it has that."""
+_log = logging.getLogger(__name__)
+
+
+def after_training(trained: Trained) -> str:
+    """Tests what a training has learned, beside controllers, on the worlds held out.
+
+    Leaves tables and pictures in the folder of the run, also of how it learned; the tables as text.
+    """
+    config, folder = trained.config, trained.folder
+    columns = runs.read_columns(folder)
+    labels = {name: label for name, label in CURVES.items() if name in columns}
+    figure = plots.learning_curves({config.name: columns}, "transitions", labels, "transitions")
+    plots.save(figure, folder / "learning_curves.png")
+    machine.forget_programs()  # Tests need the memory.
+    test = experiment.test_environment(config, trained.held_out)
+    policies = trained.policies | baselines(config.asked)
+    groups = drive(test.env, test.params, policies, config.key("testing"))
+    write(folder, groups, REFERENCE, test.params.terrain, config.navigation.goal_radius)
+    return markdown(groups, REFERENCE)
 
 
 def drive(
@@ -39,13 +73,13 @@ def drive(
     judge: Judge = evaluate,
 ) -> dict[str, Results]:
     """Drives all tasks of the pool with each policy; the results by suite."""
-    print(f"driving {params.pool_size} tasks on {params.terrain.worlds} worlds ...", flush=True)
+    _log.info("driving %d tasks on %d worlds ...", params.pool_size, params.terrain.worlds)
     results = {}
     for name, policy in policies.items():
         start = time.perf_counter()
         results[name] = judge(env, params, policy, key)
         solved, seconds = int(np.sum(results[name].success)), time.perf_counter() - start
-        print(f"  {name}: {solved} solved, compiled and driven in {seconds:.0f} s", flush=True)
+        _log.info("  %s: %d solved, compiled and driven in %.0f s", name, solved, seconds)
     return by_suite(results, suites.suites(params.terrain))
 
 

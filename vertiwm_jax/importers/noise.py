@@ -1,10 +1,12 @@
 """Drives of a simulator as a vehicle would have logged them: sampled, late, noisy, with gaps."""
 
+from typing import Annotated
+
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from vertiwm_jax.config import NotNegative, Positive, settings
+from vertiwm_jax.config import Bounds, NotNegative, Positive, settings
 from vertiwm_jax.state import STEP_SECONDS
 
 COLUMNS = (
@@ -26,12 +28,8 @@ class NoiseConfig:
     """rad, standard deviation about each axis."""
     latency: NotNegative = 0.02
     """s by which the stamp of a pose is late; commands have stamps of their own."""
-    dropped: float = 0.05
+    dropped: Annotated[float, Bounds(0, 1, below=True)] = 0.05
     """Share of samples that are lost."""
-
-    def check(self):
-        if not 0 <= self.dropped < 1:
-            raise ValueError(f"dropped: expected 0 or more, below 1, found {self.dropped}")
 
 
 def logged(

@@ -14,7 +14,7 @@ import optax
 from flax import struct
 
 from vertiwm_jax import checkpoints, training
-from vertiwm_jax.config import Count, CountOrZero, NotNegative, Positive, settings
+from vertiwm_jax.config import ConfigError, Count, CountOrZero, NotNegative, Positive, settings
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.runs import Run
 from vertiwm_jax.training import CheckpointConfig, Work
@@ -116,7 +116,7 @@ class Fit:
     config: FitConfig
 
     def init(self, inputs: FitInputs, key: jax.Array) -> FitState:
-        """The beginning; `ValueError` if `trainable` names what the parameters do not have."""
+        """The beginning; `ConfigError` if `trainable` names what the parameters do not have."""
         trained = _pick(inputs.params, self.config.trainable)
         return FitState(
             trained=jax.tree.map(partial(jnp.array, copy=True), trained),
@@ -243,7 +243,7 @@ def _pick(params: Params, trainable: tuple[str, ...]) -> Params:
     for entry in trainable:
         if not any(within(path, entry) for path in paths):
             first = dict.fromkeys(jax.tree_util.keystr(path[:1], simple=True) for path in paths)
-            raise ValueError(
+            raise ConfigError(
                 f"trainable: expected entries like {', '.join(first)}, or some within them; "
                 f"found {entry!r}"
             )

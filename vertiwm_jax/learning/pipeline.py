@@ -14,6 +14,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
+from vertiwm_jax.config import settings
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning import autoencoders, dataset, normalisation, stages, windows
 from vertiwm_jax.learning.autoencoders import AutoencoderConfig, AutoencoderProblem, PatchData
@@ -66,7 +67,7 @@ class GateConfig:
     """Open loop; `trainable` may name parts of `transformer` and `nesam` too."""
 
 
-@dataclass(frozen=True)
+@settings
 class PipelineConfig:
     """What world model is fitted, and how."""
 
@@ -90,7 +91,7 @@ class PipelineConfig:
     gate: GateConfig = GateConfig()
     """What fuses the two."""
 
-    def __post_init__(self):
+    def check(self):
         if self.vehicle:
             vehicle.load(self.vehicle)  # That it cannot be read is to be said now.
         kinds = self.transformer.learns_from, self.nesam.learns_from

@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax import parallel
-from vertiwm_jax.config import Count, CountOrZero, NotNegative, settings
+from vertiwm_jax.config import ConfigError, Count, CountOrZero, NotNegative, settings
 from vertiwm_jax.dynamics import Dynamics, History, Params, warm_up
 from vertiwm_jax.learning import augment, windows
 from vertiwm_jax.learning.dataset import Drives
@@ -67,13 +67,13 @@ class WindowData:
         """All windows of the training drives, and some of the validation drives.
 
         Raises `DataError` when drives are too short, `MapError` when maps cannot be mirrored,
-        `ValueError` when no window has a chance to be drawn.
+        `ConfigError` when no window has a chance to be drawn.
         """
         lengths = config.context, config.horizon, config.stride
         index = windows.index(*training, *lengths)
         chance = np.asarray(config.weights)[np.asarray(index.ground)].cumsum()
         if chance[-1] == 0:
-            raise ValueError("weights: expected one above 0 of the ground driven on, found none")
+            raise ConfigError("weights: expected one above 0 of the ground driven on, found none")
         drives, terrain = training
         held_out = windows.index(*validation, *lengths)
         rows = _spread(np.asarray(held_out.ground), config.validation)

@@ -1,6 +1,7 @@
 """Stages of a longer fit: each in a folder of its own, and done once for the same inputs."""
 
 import hashlib
+import logging
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ from vertiwm_jax.learning.fitting import FitConfig, Problem
 from vertiwm_jax.runs import Run
 from vertiwm_jax.training import CheckpointConfig
 
+_log = logging.getLogger(__name__)
 INPUTS = "inputs.txt"
 """File in the folder of a stage that tells all that its result depends on."""
 
@@ -74,18 +76,18 @@ def fit(
         return params
     folder = run.folder / name
     if folder.exists() and not _is_of(folder, inputs):
-        print(f"\n{name}: its inputs have changed, it begins anew", flush=True)
+        _log.info("\n%s: its inputs have changed, it begins anew", name)
         shutil.rmtree(folder)
     for other in reuse:
         if not folder.exists() and _is_of(other / name, inputs):
-            print(f"\n{name}: from {other}", flush=True)
+            _log.info("\n%s: from %s", name, other)
             copy = run.folder / f".{name}"
             shutil.copytree(other / name, copy, dirs_exist_ok=True)
             copy.rename(folder)
     done = fitting.load(folder, params)
     if done is not None:
         return done
-    print(f"\n{name}", flush=True)
+    _log.info("\n%s", name)
     checkpoint = checkpoints.latest(folder / "checkpoints")
     with run.part(name, int(checkpoint.name) if checkpoint else 0, inputs.config) as part:
         runs.write_atomic(folder / INPUTS, str(inputs))

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vertiwm_jax.config import ConfigError
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import grid
 from vertiwm_jax.terrain.map import TerrainMap
@@ -102,7 +103,7 @@ def footprint_covered(
     needed, covered = wheel_reach + top_speed * step_seconds, PATCH_METRES / 2
     if not needed <= covered:
         fastest = (covered - wheel_reach) / step_seconds
-        raise ValueError(
+        raise ConfigError(
             f"patch: expected {PATCH_METRES} m to cover the wheels of the next pose, found a reach "
             f"of {wheel_reach:g} m + {top_speed:g} m/s x {step_seconds:g} s = {needed:g} m "
             f"> {covered:g} m; keep the top speed below {fastest:g} m/s"

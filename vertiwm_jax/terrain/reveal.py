@@ -1,12 +1,14 @@
 """Maps that become known on the way: what a vehicle has seen of its world, and what it guesses."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax.config import Bounds, ConfigError, Count, Positive, settings
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.map import TerrainMap
@@ -16,27 +18,16 @@ NEAR = 4.0
 _RINGS, _DIRECTIONS = 6, 12  # of the places in view that the plane is laid through
 
 
-@dataclass(frozen=True)
+@settings
 class RevealConfig:
     """How far sensors see, which reveal the map; all of it is known from the start by default."""
 
-    range: float = math.inf
+    range: Positive = math.inf
     """Metres at which the ground, and obstacles by their middle, are seen."""
-    field_of_view: float = 2 * math.pi
+    field_of_view: Annotated[float, Bounds(0, 2 * math.pi, above=True)] = 2 * math.pi
     """Angle about straight ahead, rad, in which they are; what is nearer than 4 m always is."""
-    cells: int = 64
+    cells: Count = 64
     """Cells along each side of the map, each of which is known or not."""
-
-    def __post_init__(self):
-        if not self.range > 0:
-            raise ValueError(f"range: expected more than 0 m, found {self.range:g}")
-        if not 0 < self.field_of_view <= 2 * math.pi:
-            raise ValueError(
-                f"field_of_view: expected more than 0 and up to 2 pi rad, "
-                f"found {self.field_of_view:g}"
-            )
-        if self.cells < 1:
-            raise ValueError(f"cells: expected at least 1, found {self.cells}")
 
     @property
     def partial(self) -> bool:
@@ -51,7 +42,7 @@ def check(config: RevealConfig, terrain: TerrainMap) -> None:
     near = min(config.range, NEAR)
     if config.partial and math.hypot(width, height) / config.cells > 2 * near:
         least = math.ceil(math.hypot(width, height) / (2 * near))
-        raise ValueError(
+        raise ConfigError(
             f"reveal.cells: expected at least {least} on a map of {width:g} x {height:g} m with a "
             f"range of {config.range:g} m, found {config.cells}"
         )

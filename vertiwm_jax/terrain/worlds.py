@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax import froude, xla
+from vertiwm_jax.config import settings
 from vertiwm_jax.terrain.classes import FIRST_DEFORMABLE, FRICTION_LIMITS, STANDARD
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -66,7 +67,7 @@ class ReliefConfig:
     clearing: float = 0.4
 
 
-@dataclass(frozen=True)
+@settings
 class WorldConfig:
     """What to draw. Worlds cycle through all pairs of a difficulty and a kind, in `labels` order.
 
@@ -83,7 +84,7 @@ class WorldConfig:
     obstructed: float = 1.0
     relief: ReliefConfig = ReliefConfig()
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         for difficulty in self.difficulties:
             if isinstance(difficulty, str) and difficulty not in MEDIAN_SLOPE_DEG:
                 raise ValueError(

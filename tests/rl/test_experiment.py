@@ -11,8 +11,8 @@ from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.suites import GroundConfig
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics import vehicle
-from vertiwm_jax.rl import task
-from vertiwm_jax.rl.task import TaskConfig
+from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl.experiment import TaskConfig
 from vertiwm_jax.terrain.classes import STANDARD
 
 GROUND = GroundConfig(suites=("easy",), suite_worlds=1, pairs=2)
@@ -32,11 +32,11 @@ def test_another_vehicle_brings_its_chassis_and_its_steering():
 
 def test_a_rover_is_tested_on_soil_of_its_scale():
     known, rover = (TaskConfig(vehicle=name, ground=GROUND) for name in ("hmmwv", "rover"))
-    ground, small = task.held_out(known), task.held_out(rover)
+    ground, small = experiment.held_out(known), experiment.held_out(rover)
     np.testing.assert_array_equal(small.elevation, ground.elevation)
     sand = STANDARD.names.index("sand")
     np.testing.assert_allclose(small.soils.cohesion[sand], 10 * ground.soils.cohesion[sand])
-    test = task.test_environment(rover, small)
+    test = experiment.test_environment(rover, small)
     assert np.isfinite(test.params.starts.vehicle.vector).all()
     found = test.params.dynamics.vehicle
     jax.tree.map(np.testing.assert_array_equal, found, vehicle.load("rover").vehicle)
@@ -55,7 +55,7 @@ def test_models_multiply_what_is_asked_or_faster(asked, faster, found, monkeypat
     monkeypatch.setattr(machine, "multiplies_bfloat16", lambda: faster)
     chosen = TaskConfig(operands=asked)
     assert chosen.multiplied == found
-    _, params = task.dynamics(chosen, "nesam")
+    _, params = experiment.dynamics(chosen, "nesam")
     half = any(leaf.dtype == jnp.bfloat16 for leaf in jax.tree.leaves(params))
     assert half == (found == "bfloat16")
 

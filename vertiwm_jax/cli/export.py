@@ -1,0 +1,108 @@
+"""`vertiwm export`: a learned policy as robots can run it."""
+
+import io
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+import tyro
+
+from vertiwm_jax import runs
+from vertiwm_jax.cli import arguments
+from vertiwm_jax.config import ConfigError
+from vertiwm_jax.deploy import description, run_policy, stablehlo
+from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl.experiment import TrainConfig
+from vertiwm_jax.rl.learned import Corrected, MeanAction
+from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.world_model.choice import eyes
+from vertiwm_jax.world_model.perception import Eyes
+
+Record = Callable[..., bytes]
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write what a run has learned as robots can run it: StableHLO, ONNX, and NumPy alone."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of a policy's training."""
+    output: Path | None = None
+    """Folder to make; `export` in that of the run by default."""
+    seed: int = 0
+    """Which of the policies that the run trained side by side."""
+
+
+def run(name: str, words: Sequence[str]) -> None:
+    command = arguments.read(Export, name, words)
+    folder = command.output or command.run / "export"
+    record, config = _recorder(), experiment.load(command.run / "config.yaml")
+    with runs.new_folder(folder) as unfinished:
+        policy, eyes = restore(config, command.run, command.seed)
+        made = files(policy, eyes, config.asked, config.action_repeat, record)
+        for file, data in made.items():
+            runs.write_atomic(unfinished / file, data)
+    print(f"the policy is in {folder}")
+
+
+def restore(
+    config: TrainConfig, run: Path, seed: int
+) -> tuple[Corrected | MeanAction, Eyes | None]:
+    """What the run in the folder `run` has learned, as tests drive it without planning.
+
+    Also the encoders that it sees embeddings by, if it sees any. `ConfigError` or
+    `CheckpointError` if there is no such policy.
+    """
+    seeds = config.loop.seeds
+    if not 0 <= seed < seeds:
+        raise ConfigError(f"{run}: seed: expected 0 to {seeds - 1}, found {seed}")
+    # Checkpoints are read beside an environment of their kind, on any ground.
+    level = terrain_map.build(np.zeros((129, 129)), np.zeros((1, 1), np.int32))
+    policies = experiment.learned(replace(config, planning=None), level, run)
+    policy = list(policies.values())[seed]
+    assert isinstance(policy, Corrected | MeanAction)
+    return policy, eyes(config.weights) if config.navigation.embeddings else None
+
+
+def files(
+    policy: Corrected | MeanAction,
+    eyes: Eyes | None,
+    config: NavigationConfig,
+    held: int,
+    record: Record,
+) -> dict[str, bytes | str]:
+    """What the folder of a policy holds, by name.
+
+    eyes: of a policy that sees embeddings; config, held: as in `description.about`; record:
+    `onnx_graph.record`.
+    """
+    about, weights = description.about(policy, config, held), description.weights(policy)
+    arrays = io.BytesIO()
+    np.savez(arrays, allow_pickle=False, **weights)
+    size = about["observation"]["size"]
+    return {
+        "policy.json": json.dumps(about, indent=1) + "\n",
+        "policy.npz": arrays.getvalue(),
+        "policy.onnx": record(partial(run_policy.act, about, weights), size, 2),
+        # The key is not used: no learned policy is random.
+        "policy.stablehlo": stablehlo.policy(lambda seen: policy(seen, jax.random.key(0)), size),
+        "route.stablehlo": stablehlo.route(config),
+        "observe.stablehlo": stablehlo.observe(config, eyes),
+        "run_policy.py": Path(run_policy.__file__).read_bytes(),
+    }
+
+
+def _recorder() -> Record:
+    try:
+        from vertiwm_jax.deploy.onnx_graph import record
+    except ImportError as error:
+        raise ConfigError(
+            f"policy.onnx: expected the package onnx to write it, found: {error}; "
+            'pip install "vertiwm-jax[export]"'
+        ) from None
+    return record

@@ -1,0 +1,14 @@
+"""`vertiwm ppo`, `sac` and `td3`: train a driving policy and show how well it drives."""
+
+from collections.abc import Sequence
+
+from vertiwm_jax.cli import arguments
+from vertiwm_jax.evaluation import report
+from vertiwm_jax.rl import experiment
+
+
+def run(name: str, words: Sequence[str]) -> None:
+    config = arguments.resumable(experiment.TRAININGS[name], name, name, words)
+    trained = experiment.run(config)
+    print(f"\n{report.after_training(trained)}\n")
+    print(f"all of it is in {trained.folder}")

@@ -1,0 +1,380 @@
+"""Driving policies as what is learned: the settings of a training, its environments, and `run`."""
+
+import logging
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Protocol
+
+import jax
+
+from vertiwm_jax import config as configuration
+from vertiwm_jax import machine
+from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.config import Count
+from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.env import suites, tasks
+from vertiwm_jax.env.action_repeat import ActionRepeat, Controller
+from vertiwm_jax.env.agent import Agent, Policy
+from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.env.controllers import baselines
+from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.randomization import RandomizationConfig
+from vertiwm_jax.env.suites import GroundConfig
+from vertiwm_jax.env.task import NavigationConfig, TaskParams
+from vertiwm_jax.env.tasks import Tasks
+from vertiwm_jax.env.termination import TerminationReason
+from vertiwm_jax.mechanics import vehicle
+from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
+from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
+from vertiwm_jax.rl import loop
+from vertiwm_jax.rl.learned import Corrected, MeanAction, TwinValue, Value
+from vertiwm_jax.rl.loop import LoopConfig
+from vertiwm_jax.rl.off_policy import OffPolicy
+from vertiwm_jax.rl.planning import Planner, PlanningConfig
+from vertiwm_jax.rl.ppo import PPO, PPOConfig
+from vertiwm_jax.rl.sac import SAC, SACConfig
+from vertiwm_jax.rl.settings import LearningConfig
+from vertiwm_jax.rl.td3 import TD3, TD3Config
+from vertiwm_jax.runs import Run
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.training import Algorithm, keep_compiled
+from vertiwm_jax.world_model.choice import (
+    Imagined,
+    ModelName,
+    Operands,
+    choose,
+    lean,
+    rounded,
+    sighted,
+)
+
+Rows = dict[str, Policy | Agent]
+"""Policies by their names in tables."""
+_log = logging.getLogger(__name__)
+
+
+class Learning(Algorithm[Any], Protocol):
+    """An algorithm that learns a policy from environments."""
+
+    def policy(self, env_params: TaskParams, state: Any, /) -> MeanAction:
+        """What `state` has learned."""
+        ...
+
+    def value(self, env_params: TaskParams, state: Any, /) -> Value | TwinValue:
+        """What `state` expects of its policy."""
+        ...
+
+
+@configuration.settings
+class TaskConfig:
+    """What is driven, where, and with what."""
+
+    seed: int = 0
+    """Decides everything that is random."""
+    vehicle: str = HMMWV
+    """What the built-in simulator drives: the name of a vehicle that comes along, or a YAML file of
+    one; other models drive what they were fitted to."""
+    worlds: Path | None = None
+    """A Verti-Bench checkout or a folder of .npz maps; procedural worlds by default."""
+    ground: GroundConfig = GroundConfig()
+    """What worlds and tasks."""
+    navigation: NavigationConfig = NavigationConfig()
+    """What the task is; a vehicle other than the HMMWV brings a chassis of its own."""
+    variation: RandomizationConfig = RandomizationConfig()
+    """How episodes differ from what map and model say, while learning."""
+    model: ModelName = "builtin"
+    """What moves the vehicle while learning; tests after it are in the built-in simulator."""
+    weights: Path | None = None
+    """Folder of a fitted model, instead of the one that comes with the package."""
+    operands: Operands | Literal["auto"] = "auto"
+    """What learned models multiply; bfloat16 is faster on CPUs with AVX512_BF16, slower on others,
+    and leaves errors of prediction what they are to 1 %. A training that begins with auto tries
+    which it is, and keeps to it."""
+    simulator: Simulator = Simulator()
+    """The built-in simulator."""
+
+    def check(self):
+        vehicle.load(self.vehicle)  # That it cannot be read is to be said now.
+
+    @property
+    def multiplied(self) -> Operands:
+        """`operands`, or which of them are faster here."""
+        if self.operands == "auto":
+            return "bfloat16" if machine.multiplies_bfloat16() else "float32"
+        return self.operands
+
+    @property
+    def driven(self) -> VehicleConfig:
+        """The vehicle; `ConfigError` if there is no such."""
+        return vehicle.load(self.vehicle)
+
+    @property
+    def asked(self) -> NavigationConfig:
+        """`navigation` for the vehicle."""
+        if self.vehicle == HMMWV:
+            return self.navigation
+        return replace(self.navigation, chassis=Chassis.of(self.driven.vehicle))
+
+    def key(self, purpose: Literal["worlds", "tasks", "training", "testing"]) -> jax.Array:
+        """The random key of one purpose."""
+        number = ("worlds", "tasks", "training", "testing").index(purpose)
+        return jax.random.fold_in(jax.random.key(self.seed), number)
+
+
+@configuration.settings
+class TrainConfig(TaskConfig, ABC):
+    """Settings of every training; `name` is that of its algorithm's settings among them."""
+
+    name: ClassVar[str]
+
+    runs: Path = Path("runs")
+    """Folder in which the folder of this run is made."""
+    resume: Path | None = None
+    """Folder of an earlier run to go on with; what is set beside changes its configuration."""
+    wandb: str | None = None
+    """Project of Weights & Biases that gets the metrics too; needs the package `wandb`."""
+    compile_cache: Path | None = None
+    """Folder that keeps compiled programs for later runs."""
+    action_repeat: Count = 4
+    """Steps of 0.1 s that an action is held while learning; `transitions` count actions."""
+    base: Literal["look ahead", "straight to goal", "none"] = "look ahead"
+    """The controller that the policy learns to correct; it acts at every step."""
+    planning: PlanningConfig | None = None
+    """How the policy plans in tests, besides driving as it is; learning does not need it."""
+    loop: LoopConfig = LoopConfig()
+    """Seeds and checkpoints."""
+
+    @property
+    def schedule(self) -> LearningConfig:
+        """The algorithm's settings."""
+        return getattr(self, self.name)
+
+    @abstractmethod
+    def algorithm(self, env: NavigationEnv) -> Learning:
+        """The algorithm on the task, as configured."""
+
+    @property
+    def controller(self) -> Controller | None:
+        """What the policy corrects."""
+        return None if self.base == "none" else baselines(self.asked)[self.base]
+
+    def repeated(self, env: NavigationEnv) -> ActionRepeat:
+        """The task as algorithms see it."""
+        return ActionRepeat(env, self.action_repeat, self.controller)
+
+
+@configuration.settings
+class PPOTraining(TrainConfig):
+    """Train an off-road driving policy by PPO inside a model of the vehicle."""
+
+    name: ClassVar[str] = "ppo"
+    ppo: PPOConfig = PPOConfig()
+    """The algorithm."""
+
+    def algorithm(self, env: NavigationEnv) -> PPO:
+        return PPO(self.repeated(env), self.ppo, outcomes, env.senses)
+
+
+@configuration.settings
+class SACTraining(TrainConfig):
+    """Train an off-road driving policy by SAC inside a model of the vehicle."""
+
+    name: ClassVar[str] = "sac"
+    sac: SACConfig = SACConfig()
+    """The algorithm."""
+
+    def algorithm(self, env: NavigationEnv) -> OffPolicy:
+        return OffPolicy(self.repeated(env), SAC(self.sac), outcomes, env.senses)
+
+
+@configuration.settings
+class TD3Training(TrainConfig):
+    """Train an off-road driving policy by TD3 inside a model of the vehicle."""
+
+    name: ClassVar[str] = "td3"
+    td3: TD3Config = TD3Config()
+    """The algorithm."""
+
+    def algorithm(self, env: NavigationEnv) -> OffPolicy:
+        return OffPolicy(self.repeated(env), TD3(self.td3), outcomes, env.senses)
+
+
+TRAININGS: dict[str, type[TrainConfig]] = {
+    kind.name: kind for kind in (PPOTraining, SACTraining, TD3Training)
+}
+
+
+def load(file: Path) -> TrainConfig:
+    """The settings of a training, by the algorithm whose settings are in the file."""
+    text = file.read_text(encoding="utf-8") if file.is_file() else ""
+    named = [kind for name, kind in TRAININGS.items() if f"\n{name}:" in f"\n{text}"]
+    return configuration.load(named[0] if named else PPOTraining, file)
+
+
+@dataclass(frozen=True)
+class Task:
+    """An environment and its parameters."""
+
+    env: NavigationEnv
+    params: TaskParams
+
+
+def training_environment(config: TaskConfig) -> tuple[Task, TerrainMap]:
+    """What to train in, and the worlds held out for `test_environment`.
+
+    Raises like `training_ground`; weights that cannot be read raise `CheckpointError`.
+    """
+    terrain, pool, held_out = training_ground(config)
+    return environment(config, config.model, terrain, pool, config.variation), held_out
+
+
+def training_ground(config: TaskConfig) -> tuple[TerrainMap, Tasks, TerrainMap]:
+    """The worlds to train on, tasks on them, and the worlds held out for `test_environment`.
+
+    Maps that cannot be used, and tasks that cannot be driven on them, raise `ValueError`.
+    """
+    navigation, scale = config.asked, config.driven.scale
+    terrain, held_out = suites.grounds(config.ground, config.worlds, config.key("worlds"), scale)
+    # Now, and not when the training is over.
+    tests = suites.test_tasks(config.ground, held_out)
+    tasks.validate(tests, held_out, navigation.goal_radius, navigation.map_margin)
+    pool = suites.training_tasks(config.ground, terrain, navigation.chassis, config.key("tasks"))
+    return terrain, pool, held_out
+
+
+def held_out(config: TaskConfig) -> TerrainMap:
+    """The worlds that `training_environment` holds out."""
+    key, scale = config.key("worlds"), config.driven.scale
+    if config.worlds is None:
+        return suites.suite_worlds(config.ground, key, scale)
+    return suites.grounds(config.ground, config.worlds, key, scale)[1]
+
+
+def test_environment(config: TaskConfig, terrain: TerrainMap, model: ModelName = "builtin") -> Task:
+    """The test on these worlds, inside one of the models."""
+    return environment(config, model, terrain, suites.test_tasks(config.ground, terrain))
+
+
+def environment(
+    config: TaskConfig,
+    model: ModelName,
+    terrain: TerrainMap,
+    pool: Tasks,
+    variation: RandomizationConfig = RandomizationConfig(),
+) -> Task:
+    """Tasks inside one of the models."""
+    moves, params = dynamics(config, model)
+    env = NavigationEnv(moves, config.asked, variation)
+    return Task(env, env.make_params(params, terrain, pool))
+
+
+def dynamics(config: TaskConfig, model: Imagined) -> tuple[Dynamics, Params]:
+    """One of the models, and its parameters."""
+    if model == "builtin":
+        moves, params = config.simulator, chrono_like(config.driven.vehicle)
+    else:
+        moves, params = choose(model, config.weights, vehicle=config.driven.vehicle)
+        params = rounded(params, config.multiplied)
+    if config.navigation.embeddings:
+        return sighted(model, moves, params, config.weights)
+    return lean(moves), params
+
+
+def outcomes(info: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """What is reported of an episode's last step."""
+    ending = info["ending"]
+    return {
+        "success": ending == TerminationReason.GOAL,
+        "timed_out": ending == TerminationReason.TIMED_OUT,
+        "final_distance": info["distance"],
+    }
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a training has left: its folder, what has learned, and worlds to test it on."""
+
+    config: TrainConfig
+    folder: Path
+    policies: Rows
+    held_out: TerrainMap
+
+
+def run(config: TrainConfig) -> Trained:
+    """Trains, or goes on with, the policies of one training.
+
+    Tells by logging what it does. Raises `UserError` where settings, maps, tasks, an earlier run or
+    the disk do not allow it, and `TrainingInterrupted` at Ctrl-C once all is saved.
+    """
+    keep_compiled(config.compile_cache)
+    config = replace(config, operands=config.multiplied)  # So that it goes on as it began.
+    _log.info("drawing worlds ...")
+    terrain, pool, held_out = training_ground(config)
+    machine.forget_programs()
+    moves, weights = dynamics(config, config.model)
+    env = NavigationEnv(moves, config.asked, config.variation)
+    shapes = env.shapes(weights, terrain, pool)
+    algorithm, schedule, seeds = config.algorithm(env), config.schedule, config.loop.seeds
+    steps = schedule.collected * config.action_repeat
+    restored = loop.restore(algorithm, shapes, config.resume, seeds) if config.resume else None
+    if not restored or restored[0] < schedule.iterations:
+        # Now, while there are no vehicles yet that fill the memory.
+        loop.prepare(algorithm, shapes, seeds, schedule.shareable)
+    _log.info("placing vehicles for %s tasks ...", f"{len(pool.world):,}")
+    params = env.make_params(weights, terrain, pool)
+    machine.forget_programs()
+    with Run.begin(config, config.name, restored[0] if restored else 0, config.wandb) as begun:
+        _log.info("run folder %s", begun.folder)
+        products = "" if config.model == "builtin" else f", multiplying {config.operands}"
+        _log.info("training in %s on %d worlds%s", config.model, terrain.worlds, products)
+        state = loop.train(
+            algorithm,
+            params,
+            config.key("training"),
+            begun,
+            schedule.iterations,
+            steps,
+            schedule.shareable,
+            config.loop,
+            restored,
+        )
+    return Trained(config, begun.folder, _policies(config, algorithm, params, state), held_out)
+
+
+def learned(config: TrainConfig, terrain: TerrainMap, run: Path) -> Rows:
+    """The policies of the run in the folder `run`, one a seed; `CheckpointError` if none.
+
+    terrain: any worlds that tests can be drawn on.
+    """
+    moves, weights = dynamics(config, config.model)
+    env = NavigationEnv(moves, config.asked, config.variation)
+    params = env.shapes(weights, terrain, suites.test_tasks(config.ground, terrain))
+    algorithm = config.algorithm(env)
+    restored = loop.restore(algorithm, params, run, config.loop.seeds)
+    if restored is None:
+        raise CheckpointError(f"{run}: expected checkpoints of a training, found none")
+    return _policies(config, algorithm, params, restored[1])
+
+
+def _policies(config: TrainConfig, algorithm: Learning, params: TaskParams, state: Any) -> Rows:
+    base, rows = config.controller, {}
+    for seed in range(config.loop.seeds):
+        of_seed = jax.tree.map(lambda x, seed=seed: x[seed], state)
+        policy, name = algorithm.policy(params, of_seed), config.name
+        if config.loop.seeds > 1:
+            name = f"{config.name}, seed {seed}"
+        rows[name] = Corrected(base, policy) if base else policy
+        if config.planning:
+            moves, weights = dynamics(config, config.planning.model)
+            rows[f"{name} with planning"] = Planner(
+                env=NavigationEnv(moves, config.asked),
+                dynamics=weights,
+                policy=policy,
+                value=algorithm.value(params, of_seed),
+                base=base,
+                interval=config.action_repeat,
+                discount=config.schedule.discount,
+                config=config.planning,
+            )
+    return rows
