@@ -29,5 +29,5 @@ def test_larger_ground_is_the_same_but_for_its_scale():
         np.testing.assert_allclose(getattr(large, name), 10 * getattr(small, name), rtol=1e-6)
     np.testing.assert_array_equal(large.friction, small.friction)
     sand = STANDARD.names.index("sand")
-    assert large.soils.cohesion[sand] == 10 * small.soils.cohesion[sand]
-    assert large.soils.n[sand] == small.soils.n[sand]
+    assert large.soils.cohesion[0, sand] == 10 * small.soils.cohesion[0, sand]
+    assert large.soils.n[0, sand] == small.soils.n[0, sand]

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.patches import PATCH_METRES, PATCH_PIXELS, RELIEF_METRES
 
@@ -54,7 +55,7 @@ class Ground(NamedTuple):
         semantic, grip = np.asarray(terrain.semantic, np.int64), terrain.grip
         _, rows, columns = terrain.elevation.shape
         resolution = float(terrain.resolution)
-        soils: Any = [getattr(terrain.soils, name) for name in SOIL]
+        soils: Any = [getattr(query.soils(terrain), name) for name in SOIL]
         return cls(
             heights=tensor(terrain.elevation)[:, None],
             colours=tensor(palette[semantic].transpose(0, 3, 1, 2)).contiguous(),

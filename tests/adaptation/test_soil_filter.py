@@ -42,7 +42,7 @@ class Linear:
 
     def step(self, params, terrain, history, state, command):
         kind = query.surface(terrain, state.position[:2]).semantic
-        logits = logit(soil_predictor.shares(jax.tree.map(lambda x: x[kind], terrain.soils)))
+        logits = logit(soil_predictor.shares(query.soil(terrain, kind)))
         last = history % self.period == self.period - 1
         moved = jnp.where(last, params @ logits, 0.0)
         position = state.position + moved[:3] + jnp.stack([0.1 * command.speed, 0.0, 0.0])
@@ -138,13 +138,13 @@ def test_another_drive_begins_with_what_is_known():
 
 def test_at_first_the_map_is_believed():
     terrain = ground(MUD)
-    soils = believed(terrain, SoilFilter().init(terrain, still())).soils
+    soils = query.soils(believed(terrain, SoilFilter().init(terrain, still())))
     for name in ("kphi", "n", "friction_angle", "shear_modulus"):
-        found, expected = getattr(soils, name), getattr(terrain.soils, name)
+        found, expected = getattr(soils, name), getattr(query.soils(terrain), name)
         np.testing.assert_allclose(found, expected, rtol=1e-4)
     # Mud has neither cohesion nor kc: as little of both as does not matter.
     assert soils.cohesion[MUD] < 20 and soils.kc[MUD] < 20
-    np.testing.assert_array_equal(soils.unit_weight, terrain.soils.unit_weight)
+    np.testing.assert_array_equal(soils.unit_weight, terrain.soils.unit_weight[0])
 
 
 def test_physics_is_differentiated_exactly_and_has_to_read_the_map():
@@ -209,7 +209,7 @@ def test_a_soil_that_the_map_has_wrong_is_recovered_while_driving():
     last = jax.tree.map(lambda x: x[-1], beliefs)
     grounds = {"true": terrain, "wrong": wrong, "adapted": believed(wrong, last)}
     felt = {
-        name: [float(x[MUD]) for x in behaviour(params, ground.soils)]
+        name: [float(x[MUD]) for x in behaviour(params, query.soils(ground))]
         for name, ground in grounds.items()
     }
     for i in range(2):

@@ -12,7 +12,7 @@ from vertiwm_jax.env.route import RouteConfig
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain import obstacles
+from vertiwm_jax.terrain import obstacles, query
 
 CHASSIS = Chassis()
 ROUTE = RouteConfig()
@@ -206,7 +206,7 @@ def test_obstacles_soil_and_the_edge_are_seen():
 def test_softer_soil_sinks_more_and_rigid_ground_not_at_all():
     sinkage = np.asarray(observation.plate_sinkage(world()))
     assert (sinkage[:7] == 0).all() and (sinkage[7:] > 0).all()
-    soils = world().soils
+    soils = query.soils(world())
     pressure = (soils.kc[SNOW] / 0.25 + soils.kphi[SNOW]) * sinkage[SNOW] ** soils.n[SNOW]
     np.testing.assert_allclose(pressure, 50e3, rtol=1e-4)
 

@@ -31,7 +31,7 @@ class Slowed:
 
     def step(self, params, terrain, history, state, command):
         kind = query.surface(terrain, state.position[:2]).semantic
-        soil = jax.tree.map(lambda x: x[kind], terrain.soils)
+        soil = query.soil(terrain, kind)
         ahead = 0.1 * command.speed * soil_predictor.shares(soil)[1]
         return replace(state, position=state.position.at[0].add(ahead)), history
 
@@ -72,8 +72,8 @@ def test_predictions_get_better_as_the_drive_goes_on():
 def test_wrong_soils_are_those_of_soft_ground_alone():
     wrong = adaptation.mistaken(TERRAIN, PRESETS["snow"])
     soft = np.asarray(TERRAIN.deformable)
-    assert (np.asarray(wrong.soils.kphi)[soft] == PRESETS["snow"].kphi).all()
-    same = np.asarray(wrong.soils.kphi == TERRAIN.soils.kphi)
+    assert (np.asarray(wrong.soils.kphi)[0, soft] == PRESETS["snow"].kphi).all()
+    same = np.asarray(wrong.soils.kphi == TERRAIN.soils.kphi)[0]
     assert same[~soft].all()
 
 
@@ -98,7 +98,7 @@ def test_recovery_tells_what_the_soil_does():
     wrong = adaptation.mistaken(TERRAIN, PRESETS["snow"])
     count = np.zeros((2, 3, 10), int)
     count[0, -1, MUD] = 9
-    soils = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 3, *x.shape)), TERRAIN.soils)
+    soils = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 3, *x.shape)), query.soils(TERRAIN))
     adapted = adaptation.Adapted(soils, count, 0 * count, 8)
     (row,) = adaptation.recovery(chrono_like(hmmwv()), TERRAIN, wrong, adapted)
     assert row["soil"] == "mud" and row["drives"] == "1" and row["measurements, refused"] == "9, 0"

@@ -250,7 +250,7 @@ def test_a_policy_drives_from_goal_to_goal(maps, eyes):
         state = np.append(goal, np.zeros(9)).astype(np.float32)
     assert np.linalg.norm(np.diff(goals, axis=0), axis=-1).min() >= 20
     command = collect.Collect(output=maps, seconds=2.0)
-    alone = collect._single(terrain, 0)
+    alone = jax.device_get(terrain.subset(np.array([0])))
     task = collect.Task(command, hmmwv(), (policy, config, eyes), alone, 0, drive=1)
     drive = collect.record(task)
     assert drive.control.shape == (20, 2) and np.all(drive.control[:, 0] == 2.5)

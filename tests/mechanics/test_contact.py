@@ -90,7 +90,7 @@ def test_what_carries_a_wheel_on_soil_is_soil():
     found = wheels(halves(MUD, CONCRETE), x=-0.2, depth=LEAST_YIELD, sinkage=LEAST_YIELD)
     assert found.soft[0]
     assert found.friction[0] == 0
-    assert found.soil.kphi[0] == halves(MUD, MUD).soils.kphi[MUD]
+    assert found.soil.kphi[0] == halves(MUD, MUD).soils.kphi[0, MUD]
 
 
 def test_driving_out_of_deep_snow_onto_concrete_is_climbing_a_step():

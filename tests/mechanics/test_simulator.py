@@ -362,7 +362,7 @@ def test_gradients_agree_with_differences(final, kind):
             0.05,
         ),
         "kphi": (
-            kphi[SNOW] * by_soils.kphi[SNOW],
+            kphi[0, SNOW] * by_soils.kphi[0, SNOW],
             lambda d: value(soils=replace(snow, kphi=kphi * (1 + d))),
             0.05,
         ),

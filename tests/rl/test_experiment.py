@@ -35,7 +35,7 @@ def test_a_rover_is_tested_on_soil_of_its_scale():
     ground, small = experiment.held_out(known), experiment.held_out(rover)
     np.testing.assert_array_equal(small.elevation, ground.elevation)
     sand = STANDARD.names.index("sand")
-    np.testing.assert_allclose(small.soils.cohesion[sand], 10 * ground.soils.cohesion[sand])
+    np.testing.assert_allclose(small.soils.cohesion[0, sand], 10 * ground.soils.cohesion[0, sand])
     test = experiment.test_environment(rover, small)
     assert np.isfinite(test.params.starts.vehicle.vector).all()
     found = test.params.dynamics.vehicle

@@ -57,9 +57,9 @@ def test_load_reads_a_map_of_the_drives(tmp_path):
     assert terrain.worlds == 1 and terrain.semantic.shape == (1, 4, 4)
     assert terrain.friction[0, 0, 0] == 0 and terrain.friction[0, 0, 1] == 0.5
     snow = STANDARD.names.index("snow")
-    assert terrain.soils.kphi[snow] == pytest.approx(0.3e6)  # the file's, not the preset's
-    assert terrain.soils.friction_angle[snow] == pytest.approx(np.pi / 6)
-    assert terrain.soils.unit_weight[snow] == STANDARD.soils["snow"].unit_weight
+    assert terrain.soils.kphi[0, snow] == pytest.approx(0.3e6)  # the file's, not the preset's
+    assert terrain.soils.friction_angle[0, snow] == pytest.approx(np.pi / 6)
+    assert terrain.soils.unit_weight[0, snow] == STANDARD.soils["snow"].unit_weight
     np.testing.assert_array_equal(terrain.deformable, np.arange(10) >= 7)
 
 

@@ -1,8 +1,12 @@
+from dataclasses import replace
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.classes import STANDARD
 from vertiwm_jax.terrain.map import MapError
 
@@ -59,7 +63,7 @@ def test_each_defect_is_named(changes, message):
         ({"deformable": jnp.zeros(3, bool)}, r"deformable: expected shape \(10\)"),
         ({"friction": jnp.full((1, 4, 4), 0.5)}, r"friction: expected 0 on soil"),
         ({"world": jnp.int32(2)}, r"world: expected 0 to 0, found 2"),
-        ({"soils": STANDARD.soils["mud"]}, r"soils.kc: expected shape \(10\)"),
+        ({"soils": STANDARD.soils["mud"]}, r"soils.kc: expected shape \(1, 10\)"),
     ],
 )
 def test_each_defect_of_a_finished_map_is_named(changes, message):
@@ -70,7 +74,7 @@ def test_each_defect_of_a_finished_map_is_named(changes, message):
 
 def test_a_soil_out_of_range_is_named():
     terrain = build()
-    soils = terrain.soils.replace(n=terrain.soils.n.at[7].set(40.0))
+    soils = terrain.soils.replace(n=terrain.soils.n.at[0, 7].set(40.0))
     with pytest.raises(MapError, match=r"my.npz: soils: .*n: .*found 40"):
         terrain_map.validate(terrain.replace(soils=soils), "my.npz")
 
@@ -96,6 +100,20 @@ def test_stack_joins_worlds_and_pads_obstacles():
     np.testing.assert_array_equal(both.elevation[:, 0, 0], [0, 1, 0])
     np.testing.assert_array_equal(both.obstacles[:, 0, 2], [0, 3, 0])
     terrain_map.validate(both)
+
+
+def test_every_world_may_have_soils_of_its_own():
+    one = build()
+    firm = one.with_soils(replace(query.soils(one), kphi=2 * query.soils(one).kphi))
+    assert len(terrain_map.stack([one, one]).soils.n) == 1
+    both = terrain_map.validate(terrain_map.stack([one, terrain_map.stack([firm, one])]))
+    sand = STANDARD.names.index("sand")
+    found = jax.vmap(lambda i: query.soil(both.select(i), jnp.int32(sand)).kphi)(jnp.arange(3))
+    np.testing.assert_array_equal(found / found[0], [1, 2, 1])
+    kept = both.subset(np.array([2, 1]))
+    assert kept.worlds == 2 and query.soils(kept.select(jnp.int32(1))).kphi[sand] == found[1]
+    everywhere = kept.with_soils(query.soils(firm)).select(jnp.int32(0))
+    assert query.soils(everywhere).kphi[sand] == found[1]
 
 
 @pytest.mark.parametrize(

@@ -252,8 +252,8 @@ def test_predicted_soils_are_those_of_the_predictor_wherever_it_drives():
     perception = model.init(PARAMS, TERRAIN, state).perception
     soil = SoilPredictor().apply(PARAMS.soil, perception.semantic, jnp.float32(0))
     soils = jax.tree.map(lambda x: jnp.broadcast_to(x, TERRAIN.deformable.shape), soil)
-    soils = replace(soils, unit_weight=TERRAIN.soils.unit_weight)
-    told = replace(TERRAIN, soils=soils, deformable=jnp.ones_like(TERRAIN.deformable))
+    soils = replace(soils, unit_weight=query.soils(TERRAIN).unit_weight)
+    told = replace(TERRAIN.with_soils(soils), deformable=jnp.ones_like(TERRAIN.deformable))
     soft = replace(TERRAIN, deformable=told.deformable)
     physics = Nesam(TINY, residual=False)
     found, expected, other = (

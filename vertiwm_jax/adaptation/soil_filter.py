@@ -189,7 +189,7 @@ class SoilFilter:
 
     def _of_map(self, terrain: TerrainMap) -> Gaussian:
         """What the map says, leaves `[K, 6]` and `[K, 6, 6]`."""
-        shares = soil_predictor.shares(terrain.soils)
+        shares = soil_predictor.shares(query.soils(terrain))
         mean = logit(jnp.clip(shares, MARGIN, 1 - MARGIN))
         one = self.prior**2 * jnp.eye(mean.shape[1])
         return Gaussian(mean, jnp.broadcast_to(one, (*mean.shape, mean.shape[1])))
@@ -206,7 +206,8 @@ class SoilFilter:
 def believed(terrain: TerrainMap, belief: SoilBelief) -> TerrainMap:
     """The map with the soils that are believed in: what a model is to drive on."""
     shares = jax.nn.sigmoid(belief.soils.mean)
-    return replace(terrain, soils=soil_predictor.of_shares(shares, terrain.soils.unit_weight))
+    unit_weight = query.soils(terrain).unit_weight
+    return terrain.with_soils(soil_predictor.of_shares(shares, unit_weight))
 
 
 def _differentiable(model: Dynamics) -> Dynamics:

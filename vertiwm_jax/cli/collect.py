@@ -116,7 +116,7 @@ def collect(command: Collect) -> None:
     tasks = (
         Task(command, config.vehicle, learned, alone, world, drive)
         for world in missing
-        for alone in [_single(terrain, world)]
+        for alone in [jax.device_get(terrain.subset(np.array([world])))]
         for drive in range(command.drives)
     )
     total = len(missing) * command.drives * command.steps
@@ -130,7 +130,8 @@ def collect(command: Collect) -> None:
                 drives.append(drive)
                 done += len(drive.control)
                 progress.advance(command.steps, f"world {world}, drive {len(drives)}")
-            _write(command, config, world, _single(terrain, world), drives)
+            alone = jax.device_get(terrain.subset(np.array([world])))
+            _write(command, config, world, alone, drives)
     if done:
         print(f"{done:,} steps, {done / (time.monotonic() - began):,.0f} a second")
 
@@ -170,13 +171,6 @@ def _terrain(command: Collect, scale: float) -> TerrainMap:
     config = WorldConfig(command.difficulties, command.kinds)
     count = command.repeats * len(command.difficulties) * len(command.kinds)
     return worlds.generate(jax.random.split(jax.random.key(command.seed), count), config, scale)
-
-
-def _single(terrain: TerrainMap, world: int) -> TerrainMap:
-    """One of the worlds alone, in host memory."""
-    stacked = ("elevation", "semantic", "friction", "obstacles")
-    alone = {name: getattr(terrain, name)[world : world + 1] for name in stacked}
-    return jax.device_get(replace(terrain, **alone))
 
 
 def _learned(command: Collect) -> tuple[Policy, NavigationConfig, Eyes | None] | None:

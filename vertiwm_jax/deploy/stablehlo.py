@@ -77,7 +77,7 @@ def _terrain(
         resolution=resolution,
         class_rgb=jnp.asarray(STANDARD.rgb),
         deformable=jnp.asarray(STANDARD.deformable),
-        soils=STANDARD.stacked_soils(),
+        soils=jax.tree.map(lambda leaf: leaf[None], STANDARD.stacked_soils()),
         world=jnp.int32(0),
         class_names=STANDARD.names,
     )

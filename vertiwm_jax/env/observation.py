@@ -90,7 +90,7 @@ def plate_sinkage(terrain: TerrainMap) -> jax.Array:
 
     Bekker: p = (kc / b + kphi) z^n. One number that orders soils by how soft they are.
     """
-    soils = terrain.soils
+    soils = query.soils(terrain)
     stiffness = jnp.maximum(soils.kc / 0.25 + soils.kphi, 1.0)
     return jnp.where(terrain.deformable, (50e3 / stiffness) ** (1 / soils.n), 0.0)
 

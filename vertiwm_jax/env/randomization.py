@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.config import settings
+from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 
 _STRENGTH = "kc", "kphi", "cohesion"
@@ -72,9 +73,9 @@ class DomainRandomization:
         if self.grip is not None:
             terrain = dataclasses.replace(terrain, grip=self.grip)
         if self.soil is not None:
-            weaker = {x: self.soil * getattr(terrain.soils, x) for x in _STRENGTH}
-            soils = dataclasses.replace(terrain.soils, **weaker)
-            terrain = dataclasses.replace(terrain, soils=soils)
+            soils = query.soils(terrain)
+            weaker = {x: self.soil * getattr(soils, x) for x in _STRENGTH}
+            terrain = terrain.with_soils(dataclasses.replace(soils, **weaker))
         return terrain
 
     def arriving(self, action: jax.Array) -> tuple[jax.Array, Self]:

@@ -69,7 +69,7 @@ def grounds(
         )
     number = np.arange(terrain.worlds)
     held_out = number % config.held_out_every == config.held_out_every - 1
-    return _subset(terrain, ~held_out), _subset(terrain, held_out)
+    return terrain.subset(~held_out), terrain.subset(held_out)
 
 
 def suite_worlds(config: GroundConfig, key: jax.Array, scale: float = 1.0) -> TerrainMap:
@@ -129,11 +129,6 @@ def difficulties(terrain: TerrainMap) -> list[str]:
     presets = np.array(list(MEDIAN_SLOPE_DEG.values()))
     slopes = map(_median_slope_deg, np.asarray(terrain.elevation) / float(terrain.resolution))
     return [names[int(np.argmin(np.abs(presets - slope)))] for slope in slopes]
-
-
-def _subset(terrain: TerrainMap, chosen: np.ndarray) -> TerrainMap:
-    stacked = ("elevation", "semantic", "friction", "obstacles")
-    return replace(terrain, **{name: getattr(terrain, name)[chosen] for name in stacked})
 
 
 def _median_slope_deg(heights: np.ndarray) -> float:

@@ -1,7 +1,7 @@
 """What adapting soils is worth: predictions with soils that the map has wrong, and corrected."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import jax
@@ -21,6 +21,7 @@ from vertiwm_jax.mechanics.simulator import SimulatorParams, stiffened
 from vertiwm_jax.mechanics.vehicle import GRAVITY
 from vertiwm_jax.mechanics.wheel import Wheel
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
+from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
 
@@ -48,10 +49,13 @@ class Adapted:
 
 def mistaken(terrain: TerrainMap, soil: Soil) -> TerrainMap:
     """The map with one soil `[]` for all that is deformable."""
-    soils = jax.tree.map(
-        lambda new, old: jnp.where(terrain.deformable, new, old), soil, terrain.soils
-    )
-    return replace(terrain, soils=soils)
+    if len(terrain.soils.n) > 1:
+        raise DataError("expected the same soils in all worlds, found worlds that differ in theirs")
+
+    def put(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(terrain.deformable, new, old)
+
+    return terrain.with_soils(jax.tree.map(put, soil, query.soils(terrain)))
 
 
 def adapt(
@@ -59,7 +63,7 @@ def adapt(
 ) -> Adapted:
     """Every drive by itself, all from what the map says."""
     beliefs = _follow(soil_filter, model, params, terrain, jax.tree.map(jnp.asarray, drives))
-    soils = jax.jit(jax.vmap(jax.vmap(lambda x: believed(terrain, x).soils)))(beliefs)
+    soils = jax.jit(jax.vmap(jax.vmap(lambda x: query.soils(believed(terrain, x)))))(beliefs)
     counts = np.asarray(beliefs.accepted), np.asarray(beliefs.refused)
     return Adapted(soils, *counts, soil_filter.horizon)
 
@@ -127,12 +131,12 @@ def errors(
     begins = np.asarray(index.start) + CONTEXT
     block = begins // adapted.every - 1
     rows = {
-        "true": _repeated(terrain.soils, len(drive)),
-        "wrong": _repeated(wrong.soils, len(drive)),
+        "true": _repeated(query.soils(terrain), len(drive)),
+        "wrong": _repeated(query.soils(wrong), len(drive)),
         "wrong, adapted": jax.tree.map(
             lambda x, y: jnp.where((block >= 0)[:, None], x[drive, np.maximum(block, 0)], y),
             adapted.soils,
-            wrong.soils,
+            query.soils(wrong),
         ),
     }
     period = np.digitize(begins * STEP_SECONDS, PERIODS) - 1
@@ -155,7 +159,7 @@ def _errors(
 
     def one(inputs: tuple[Windows, Soil]) -> jax.Array:
         window, believed_in = inputs
-        ground = replace(terrain.select(window.world), soils=believed_in)
+        ground = terrain.select(window.world).with_soils(believed_in)
         final = open_loop(model, params, ground, window, lambda _: None)[0].position[-1]
         final = jnp.where(jnp.isfinite(final).all(), final, window.state[window.context, :3])
         return jnp.linalg.norm(final - window.state[-1, :3])
@@ -179,7 +183,8 @@ def recovery(
     params: SimulatorParams, terrain: TerrainMap, wrong: TerrainMap, adapted: Adapted
 ) -> list[dict[str, str]]:
     """A row for each soil that drives adapted to: what it does at their ends, mean over them."""
-    named = (("true", terrain.soils), ("wrong", wrong.soils), ("adapted", adapted.soils))
+    of_map = ((name, query.soils(of)) for name, of in (("true", terrain), ("wrong", wrong)))
+    named = (*of_map, ("adapted", adapted.soils))
     felt = {name: jax.jit(partial(behaviour, params))(soils) for name, soils in named}
     rows = []
     for kind in np.flatnonzero(np.asarray(terrain.deformable)):

@@ -59,6 +59,6 @@ class SoilProblem:
         latent = cast(jax.Array, _ENCODER.apply(encoder, seen.rgb))
         predicted = cast(Soil, _NETWORK.apply(params["soil"], latent, jnp.float32(0)))
         kind = query.surface(world, place.position[:2]).semantic
-        true = jax.tree.map(lambda x: x[kind], world.soils)
+        true = query.soil(world, kind)
         soft = terrain.deformable[kind].astype(jnp.float32)
         return soft * (soil_predictor.shares(predicted) - soil_predictor.shares(true)), soft

@@ -89,7 +89,7 @@ def contacts(
         depth=on_hull.depth,
         friction=on_hull.friction,
         soft=terrain.deformable[on_hull.semantic],
-        soil=jax.tree.map(lambda leaf: leaf[on_hull.semantic], terrain.soils),
+        soil=query.soil(terrain, on_hull.semantic),
         edge=jnp.zeros(1, bool),
     )
     return _wheel_contacts(terrain, on_tread, steering, sinkage), chassis
@@ -136,7 +136,7 @@ def _wheel_contacts(
         depth=shared(tread.depth) * jnp.where(edge, to_axle.z, 1.0),
         friction=shared(tread.friction),
         soft=in_soil,
-        soil=jax.tree.map(lambda leaf: leaf[below], terrain.soils),
+        soil=query.soil(terrain, below),
         edge=edge,
     )
 

@@ -144,7 +144,7 @@ class Ground:
         name = self._terrain.class_names[kind]
         if not self._terrain.deformable[kind]:
             return NO_SOIL
-        soil = {field: float(leaf[kind]) for field, leaf in vars(self._terrain.soils).items()}
+        soil = {name: float(x[kind]) for name, x in vars(query.soils(self._terrain)).items()}
         return (
             soil["kphi"],
             soil["kc"],

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from vertiwm_jax.terrain import soil
+from vertiwm_jax.terrain import query, soil
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.map import MapError, TerrainMap, build, stack
 from vertiwm_jax.terrain.soil import Soil
@@ -58,8 +58,9 @@ def save(terrain: TerrainMap, path: str | Path) -> None:
         np.minimum(np.arange(n) * cells // (n - 1), cells - 1)
         for n, cells in zip(elevation.shape, semantic.shape, strict=True)
     )
+    of_class = query.soils(terrain)
     soils = {
-        name: [float(getattr(terrain.soils, f)[k]) * unit for f, unit in _SOIL_FIELDS.values()]
+        name: [float(getattr(of_class, f)[k]) * unit for f, unit in _SOIL_FIELDS.values()]
         for k, name in enumerate(terrain.class_names)
         if deformable[k]
     }

@@ -17,7 +17,7 @@ from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.soil import Soil
 
 # What stacked worlds have in common.
-_SHARED = ("origin", "resolution", "class_rgb", "deformable", "soils")
+_SHARED = ("origin", "resolution", "class_rgb", "deformable")
 
 
 class MapError(UserError, ValueError):
@@ -44,7 +44,8 @@ class TerrainMap:
     resolution: `[]` m between vertices.
     class_rgb: `[K, 3]` uint8 palette.
     deformable: `[K]` bool, whether a class is soil.
-    soils: leaves `[K]`; rows of rigid classes are never used but finite.
+    soils: leaves `[S, K]`, S is W or, where all worlds have the same, 1; read by `query.soil`,
+        written by `with_soils`. Those of rigid classes are never used but finite.
     world: `[]` int32, the selected world.
     class_names: K names, static.
     grip: `[]` what all friction is multiplied by; None for 1.
@@ -70,9 +71,27 @@ class TerrainMap:
         """How many worlds are stacked."""
         return self.elevation.shape[0]
 
+    @property
+    def soil_set(self) -> jax.Array | int:
+        """Which of the sets of soils the selected world has."""
+        return self.world if len(self.soils.n) > 1 else 0
+
     def select(self, world: jax.Array) -> Self:
         """The map with world `[]` selected. Under `vmap` only the index is batched: no copy."""
         return replace(self, world=jnp.asarray(world, jnp.int32))
+
+    def subset(self, worlds: np.ndarray) -> Self:
+        """The map of some worlds alone, chosen by number or by bool; the first is selected."""
+        names = ("elevation", "semantic", "friction", "obstacles")
+        changes = {name: getattr(self, name)[worlds] for name in names}
+        if len(self.soils.n) > 1:
+            changes["soils"] = jax.tree.map(lambda leaf: leaf[worlds], self.soils)
+        return replace(self, **changes, world=jnp.int32(0))
+
+    def with_soils(self, soils: Soil) -> Self:
+        """The map with the same soils in all worlds: leaves `[K]`, or `[]` for all classes."""
+        shape = (1, *self.deformable.shape)
+        return replace(self, soils=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape), soils))
 
 
 def build(
@@ -115,7 +134,7 @@ def build(
         resolution=jnp.float32(resolution),
         class_rgb=jnp.asarray(classes.rgb, jnp.uint8),
         deformable=jnp.asarray(classes.deformable),
-        soils=classes.stacked_soils(),
+        soils=jax.tree.map(lambda leaf: leaf[None], classes.stacked_soils()),
         world=jnp.int32(0),
         class_names=classes.names,
     )
@@ -125,8 +144,8 @@ def build(
 def stack(maps: Sequence[TerrainMap], names: Sequence[str] | None = None) -> TerrainMap:
     """Concatenates worlds of maps of equal extent, classes and scale; world 0 is selected.
 
-    Obstacle lists are padded to the longest. Raises `MapError` naming the first map that
-    differs (by `names`, or its place) and the field.
+    Soils may differ. Obstacle lists are padded to the longest. Raises `MapError` naming the first
+    map that differs (by `names`, or its place) and the field.
     """
     if not maps:
         raise MapError("stack", "maps", "at least one map", "none")
@@ -158,8 +177,23 @@ def stack(maps: Sequence[TerrainMap], names: Sequence[str] | None = None) -> Ter
         semantic=jnp.concatenate([m.semantic for m in maps]),
         friction=jnp.concatenate([m.friction for m in maps]),
         obstacles=jnp.concatenate([padded(m) for m in maps]),
+        soils=_stacked_soils(maps),
         world=jnp.int32(0),
     )
+
+
+def _stacked_soils(maps: Sequence[TerrainMap]) -> Soil:
+    """Those of all maps, one set if they have the same."""
+    first, *others = [m.soils for m in maps]
+    if len(first.n) == 1 and all(_alike(first, soils) for soils in others):
+        return first
+    worlds = [m.select(jnp.int32(i)) for m in maps for i in range(m.worlds)]
+    return soil.stack([jax.tree.map(lambda x, i=m.soil_set: x[i], m.soils) for m in worlds])
+
+
+def _alike(ours: Soil, theirs: Soil) -> bool:
+    pairs = zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True)
+    return all(a.shape == b.shape and np.allclose(a, b) for a, b in pairs)
 
 
 def validate(terrain: TerrainMap, name: str = "map") -> TerrainMap:
@@ -238,7 +272,8 @@ def _check_shapes(terrain: TerrainMap, worlds: int, classes: int, name: str) -> 
     }
     leaves = {field: getattr(terrain, field) for field in expected}
     for field, value in vars(terrain.soils).items():
-        expected[f"soils.{field}"], leaves[f"soils.{field}"] = (classes,), value
+        sets = worlds if jnp.shape(value)[:1] == (worlds,) else 1
+        expected[f"soils.{field}"], leaves[f"soils.{field}"] = (sets, classes), value
     for field, shape in expected.items():
         found = jnp.shape(leaves[field])
         agrees = len(found) == len(shape) and all(

@@ -6,6 +6,7 @@ from flax import struct
 
 from vertiwm_jax.terrain import grid
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.soil import Soil
 
 
 @struct.dataclass
@@ -55,6 +56,16 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
         known = grid.known(terrain, terrain.belief, row, column)
         friction = jnp.where(known, friction, terrain.belief.friction)
     return Surface(height, gradient, semantic, friction)
+
+
+def soil(terrain: TerrainMap, semantic: jax.Array) -> Soil:
+    """The soils `[...]` of ground classes `[...]` in the selected world; of rigid ones any."""
+    return jax.tree.map(lambda leaf: leaf[semantic], soils(terrain))
+
+
+def soils(terrain: TerrainMap) -> Soil:
+    """The soils `[K]` of all ground classes in the selected world."""
+    return jax.tree.map(lambda leaf: leaf[terrain.soil_set], terrain.soils)
 
 
 def height(terrain: TerrainMap, xy: jax.Array) -> jax.Array:

@@ -131,6 +131,7 @@ def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> Terrai
         )
         for i in range(len(keys))
     ]
+    soils = froude.scaled(STANDARD.stacked_soils(), scale)
     # By NumPy: to stack so many arrays would be a program for every number of worlds.
     stacked = map(np.stack, zip(*jax.device_get(parts), strict=True))
     elevation, semantic, friction, obstacles = map(jnp.asarray, stacked)
@@ -143,7 +144,7 @@ def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> Terrai
         resolution=jnp.float32(RESOLUTION),
         class_rgb=jnp.asarray(STANDARD.rgb),
         deformable=jnp.asarray(STANDARD.deformable),
-        soils=froude.scaled(STANDARD.stacked_soils(), scale),
+        soils=jax.tree.map(lambda leaf: leaf[None], soils),
         world=jnp.int32(0),
         class_names=STANDARD.names,
     )

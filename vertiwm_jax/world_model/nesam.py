@@ -12,6 +12,7 @@ from vertiwm_jax.networks.encoder import LATENT_CHANNELS
 from vertiwm_jax.networks.soil_predictor import SoilPredictor
 from vertiwm_jax.networks.transformer import KeyValueCache
 from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
 from vertiwm_jax.world_model import motion, step_features
@@ -231,11 +232,7 @@ class Nesam:
             return terrain
         assert isinstance(perception, Perception), "without latents it cannot predict the soil"
         predicted = cast(Soil, _SOIL.apply(params.soil, perception.semantic, jnp.float32(0)))
-        everywhere = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, terrain.deformable.shape), predicted
-        )
-        soils = replace(everywhere, unit_weight=terrain.soils.unit_weight)
-        return replace(terrain, soils=soils)
+        return terrain.with_soils(replace(predicted, unit_weight=query.soils(terrain).unit_weight))
 
     def _physics(
         self,
