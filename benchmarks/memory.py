@@ -39,7 +39,7 @@ def main() -> None:
     terrain, pool, _ = experiment.training_ground(config)
     machine.forget_programs()
     dynamics, weights = experiment.dynamics(config, config.model)
-    env = NavigationEnv(dynamics, config.asked, config.variation)
+    env = NavigationEnv(dynamics, config.navigation, config.variation)
     algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
     training.compiled(algorithm, env.shapes(weights, terrain, pool), batch)
     results["compiled"] = {"most_MB": most()}

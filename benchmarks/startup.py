@@ -54,7 +54,7 @@ def phases(name: str) -> dict[str, dict[str, float]]:
     machine.forget_programs()
     lap("worlds")
     dynamics, weights = experiment.dynamics(config, config.model)
-    env = NavigationEnv(dynamics, config.asked, config.variation)
+    env = NavigationEnv(dynamics, config.navigation, config.variation)
     algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
     training.compiled(algorithm, env.shapes(weights, terrain, pool), batch)
     lap("compile")

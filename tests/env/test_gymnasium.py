@@ -36,8 +36,8 @@ def test_single_ends_by_truncation_and_shows_the_world(short):
     picture = env.render()
     assert picture.shape == (512, 512, 3) and picture.dtype == np.uint8
     red = (picture == np.round(255 * np.array([0.8, 0.05, 0.05]))).all(-1)
-    # 4.6 m x 2.2 m, less the white nose, at 16 pixels a square metre.
-    assert red.sum() == pytest.approx(0.75 * 4.6 * 2.2 * 16, rel=0.15)
+    # 4.6 m x 2.1 m, less the white nose, at 16 pixels a square metre.
+    assert red.sum() == pytest.approx(0.75 * 4.6 * 2.1 * 16, rel=0.15)
 
 
 def test_single_knows_its_render_modes(short):

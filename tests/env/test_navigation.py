@@ -10,7 +10,6 @@ from env.worlds import BICYCLE, Scripted, bicycle_env, ground, hills, step_of_ma
 from flax import struct
 
 from vertiwm_jax import parallel
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.reward import RewardConfig
@@ -18,6 +17,7 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
+from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.rl import experiment as task_of_learning
 from vertiwm_jax.rl.experiment import TaskConfig
 from vertiwm_jax.state import Command, VehicleState
@@ -171,13 +171,14 @@ def test_reward_of_a_step_is_that_computed_by_hand():
 
 
 def test_actions_are_commands_and_back():
-    config = NavigationConfig(speed_range=(-1.0, 5.0), chassis=Chassis(steering_limit=0.4))
-    command = config.command(jnp.array([[-1.0, 0.5], [1.0, -3.0], [0.0, 0.0]]))
+    vehicle, speeds = hmmwv().replace(steering_limit=jnp.float32(0.4)), (-1.0, 5.0)
+    command = vehicle.command(jnp.array([[-1.0, 0.5], [1.0, -3.0], [0.0, 0.0]]), speeds)
     np.testing.assert_allclose(command.speed, [-1, 5, 2], rtol=1e-6)
     np.testing.assert_allclose(command.steering, [0.2, -0.4, 0], rtol=1e-6)
-    action = config.action(Command(jnp.float32(3.5), jnp.float32(-0.1)))
+    action = vehicle.action(Command(jnp.float32(3.5), jnp.float32(-0.1)), speeds)
     np.testing.assert_allclose(action, [0.5, -0.25], rtol=1e-6)
-    np.testing.assert_allclose(config.action(Command(jnp.float32(9), jnp.float32(0))), [1, 0])
+    fast = Command(jnp.float32(9), jnp.float32(0))
+    np.testing.assert_allclose(vehicle.action(fast, speeds), [1, 0])
 
 
 def test_starts_stand_on_the_ground_and_resets_draw_all_of_them():
@@ -266,7 +267,8 @@ def test_equal_environments_are_one_static_argument():
 
 def test_a_patch_must_cover_the_next_footprint():
     with pytest.raises(ValueError, match="top speed"):
-        NavigationEnv(KinematicBicycle(), NavigationConfig(speed_range=(0.0, 60.0)))
+        config = NavigationConfig(speed_range=(0.0, 60.0))
+        bicycle_env(ground(), task((0.0, 0.0), (30.0, 0.0)), config)
 
 
 def test_a_model_that_cannot_stand_is_named():

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,15 +5,15 @@ import pytest
 from env.worlds import GRASS, SNOW, hills
 
 from vertiwm_jax.env import observation, route
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.route import RouteConfig
-from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import obstacles, query
 
-CHASSIS = Chassis()
+HMMWV = hmmwv()
 ROUTE = RouteConfig()
+POSES = jax.tree.map(np.asarray, observation.poses_ahead(HMMWV))
 OBSTACLE = np.array([[9.0, 3.0, 4.0, 6.0, 2.0]], np.float32)
 CLASSES = slice(observation.GROUND.stop, None)
 
@@ -24,7 +22,7 @@ CLASSES = slice(observation.GROUND.stop, None)
 def observe(terrain, vehicle, goal, action):
     """What is seen where the way to the goal is straight."""
     routes = route.straight(ROUTE, terrain, goal[None, :2])
-    return observation.observe(terrain, CHASSIS, vehicle, goal, routes, action)
+    return observation.observe(terrain, HMMWV, vehicle, goal, routes, action)
 
 
 def vehicle(x, y, yaw):
@@ -73,19 +71,19 @@ def test_layout_and_units():
 
 
 def test_poses_lie_on_the_arcs_of_a_bicycle():
-    xy, heading = observation.poses_ahead(CHASSIS)
+    xy, heading = POSES
     assert xy[0].tolist() == [0, 0] and heading[0] == 0
     shape = observation.ARC_STEERING.size, observation.ARC_STATIONS.size
     x, y = xy[1:].reshape(*shape, 2).transpose(2, 0, 1)
     heading = heading[1:].reshape(shape)
-    driven = CHASSIS.wheelbase * observation.ARC_STATIONS
-    np.testing.assert_allclose(x[4], driven)
+    driven = HMMWV.wheelbase * observation.ARC_STATIONS
+    np.testing.assert_allclose(x[4], driven, rtol=1e-6)
     np.testing.assert_allclose([y[4], heading[4]], 0, atol=1e-12)
     # The sharpest one, to the left, goes round (0, radius).
-    radius = CHASSIS.wheelbase / np.tan(CHASSIS.steering_limit)
-    np.testing.assert_allclose(np.hypot(x[-1], y[-1] - radius), radius)
-    np.testing.assert_allclose(np.arctan2(x[-1], radius - y[-1]), driven / radius)
-    np.testing.assert_allclose(heading[-1], driven / radius)
+    radius = HMMWV.wheelbase / np.tan(HMMWV.steering_limit)
+    np.testing.assert_allclose(np.hypot(x[-1], y[-1] - radius), radius, rtol=1e-6)
+    np.testing.assert_allclose(np.arctan2(x[-1], radius - y[-1]), driven / radius, rtol=1e-6)
+    np.testing.assert_allclose(heading[-1], driven / radius, rtol=1e-6)
     np.testing.assert_allclose([x[0], -y[0], -heading[0]], [x[-1], y[-1], heading[-1]])
 
 
@@ -99,7 +97,7 @@ def on_ground(height):
 
 def test_a_plane_rises_and_banks_and_nothing_else():
     height, crown, rise, bank, twist, _ = on_ground(lambda x, y: 0.2 * x + 0.1 * y)
-    place, heading = observation.poses_ahead(CHASSIS)
+    place, heading = POSES
     direction = heading + 0.4
     np.testing.assert_allclose(
         rise, (0.2 * np.cos(direction) + 0.1 * np.sin(direction)) / 0.4, atol=1e-3
@@ -117,11 +115,11 @@ def test_a_saddle_twists_and_a_hump_crowns():
     # At the origin, z = u v / 40 along and across the vehicle: four equal heights, signs in turn.
     cos, sin = np.cos(0.4), np.sin(0.4)
     saddle = on_ground(lambda x, y: (cos * x + sin * y) * (cos * y - sin * x) / 40)[:, 0]
-    lifted = CHASSIS.wheelbase * CHASSIS.track / 4 / 40
-    np.testing.assert_allclose(saddle[4], 4 * lifted / (2 * CHASSIS.track * 0.2), atol=0.02)
+    lifted = HMMWV.wheelbase * HMMWV.track / 4 / 40
+    np.testing.assert_allclose(saddle[4], 4 * lifted / (2 * HMMWV.track * 0.2), atol=0.02)
     np.testing.assert_allclose(saddle[1:4], 0, atol=0.02)
     hump = on_ground(lambda x, y: -(x**2 + y**2) / 20)[:, 0]
-    corner = (CHASSIS.wheelbase**2 + CHASSIS.track**2) / 4
+    corner = (HMMWV.wheelbase**2 + HMMWV.track**2) / 4
     np.testing.assert_allclose(hump[1], corner / 20 / 0.2, atol=0.1)  # bilinear between metres
     np.testing.assert_allclose(hump[2:5], 0, atol=0.05)
 
@@ -186,9 +184,9 @@ def test_obstacles_soil_and_the_edge_are_seen():
     np.testing.assert_array_equal((change != 0).any(axis=0), wall)
     assert not change[[0, 2, 3, 4, 5]].any()
     # A wall where the vehicle, and a margin of 0.3 m, would touch the obstacle.
-    place, heading = observation.poses_ahead(CHASSIS)
+    place, heading = POSES
     poses = place[1:] + np.array([4.0, 3.0]), jnp.asarray(heading[1:])
-    hit = obstacles.collides(terrain, *poses, CHASSIS.length + 0.6, CHASSIS.width + 0.6)
+    hit = obstacles.collides(terrain, *poses, HMMWV.length + 0.6, HMMWV.width + 0.6)
     np.testing.assert_array_equal(wall.ravel(), hit)
     assert 3 < hit.sum() < len(hit) - 3
 
@@ -242,16 +240,16 @@ def test_the_edge_of_the_map_is_a_wall():
     state = vehicle(edge - 5.0, 0.0, 0.0)
     found = observe(terrain, state, jnp.zeros(3), jnp.zeros(2))
     crown = np.ravel(observation.arcs_ahead(found)[1])
-    outside = observation.poses_ahead(CHASSIS)[0][1:, 0] > 5.0
+    outside = POSES[0][1:, 0] > 5.0
     np.testing.assert_allclose(crown[outside], 7.5, rtol=1e-6)
     assert np.all(crown[~outside] < 2.0) and 0 < outside.sum() < outside.size
 
 
 def test_arcs_are_those_that_a_vehicle_can_steer():
-    sharp = replace(CHASSIS, steering_limit=0.6)
+    sharp = HMMWV.replace(steering_limit=jnp.float32(0.6))
     heading = observation.poses_ahead(sharp)[1][1:].reshape(observation.ARC_STEERING.size, -1)
     # With half of the action, half of the angle: what is commanded is what was looked at.
-    command = NavigationConfig(chassis=sharp).command(jnp.array([0.0, 0.5]))
-    driven = CHASSIS.wheelbase * observation.ARC_STATIONS
-    turned = driven * np.tan(float(command.steering)) / CHASSIS.wheelbase
+    command = sharp.command(jnp.array([0.0, 0.5]), (0.0, 6.0))
+    driven = HMMWV.wheelbase * observation.ARC_STATIONS
+    turned = driven * np.tan(float(command.steering)) / HMMWV.wheelbase
     np.testing.assert_allclose(heading[6], turned, rtol=1e-6)

@@ -8,19 +8,19 @@ from env.worlds import GRASS, ground, hills
 from scipy.sparse import csgraph
 
 from vertiwm_jax.env import route
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.route import RouteConfig
 from vertiwm_jax.env.traversability import TraversabilityCost, footprint, places
+from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.terrain import map as terrain_map
 
-CHASSIS = Chassis()
+HMMWV = hmmwv()
 CONFIG = RouteConfig(cells=32)
 EAST = jnp.array([[50.0, 1.0]])
 
 
 def to(goal, terrain, config=CONFIG, world=None):
     world = jnp.zeros(len(goal), jnp.int32) if world is None else world
-    return route.plan(config, terrain, CHASSIS, world, jnp.asarray(goal, jnp.float32))
+    return route.plan(config, terrain, HMMWV, world, jnp.asarray(goal, jnp.float32))
 
 
 def ridge(gap):
@@ -107,11 +107,11 @@ def test_costs_are_those_of_the_cheapest_way():
                 move = size * np.array([east, north])
                 heading, hard = np.arctan2(north, east), []
                 for share in (0.0, 0.5, 1.0):
-                    at = np.array(places(CHASSIS, begin + share * move, jnp.float32(heading)))
-                    below = footprint(CHASSIS, jnp.asarray(bilinear(at)))
+                    at = np.array(places(HMMWV, begin + share * move, jnp.float32(heading)))
+                    below = footprint(HMMWV, jnp.asarray(bilinear(at)))
                     parts = below.crown, below.rise, below.bank, below.twist
                     hard.append(float(TraversabilityCost()(*parts)))
-                off = np.abs(begin + move / 2).max() > 64 - CHASSIS.length / 2
+                off = np.abs(begin + move / 2).max() > 64 - HMMWV.length / 2
                 each = 1 + 3.0 * np.mean(hard) + 10.0 * off
                 weights[row * cells + column, to_row * cells + to_column] = np.hypot(*move) * each
     goal = 5 * cells + 9

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from vertiwm_jax.env import suites
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.suites import GroundConfig
+from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.rl.experiment import TaskConfig
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
@@ -84,7 +84,7 @@ def test_tasks_cross_every_world_and_start_anywhere(procedural):
     assert np.bincount(np.asarray(across.world)).tolist() == [4] * 6
     np.testing.assert_allclose(np.linalg.norm(across.start, axis=-1), 60, rtol=1e-5)
     np.testing.assert_allclose(across.goal, -np.asarray(across.start), atol=1e-3)
-    tasks = suites.training_tasks(CONFIG, train, Chassis(), jax.random.key(1))
+    tasks = suites.training_tasks(CONFIG, train, hmmwv(), jax.random.key(1))
     assert tasks.start.shape == (6 + 3 * 4, 2)
     assert (np.abs(np.asarray(tasks.start)) < 64).all()
     small = suites.test_tasks(CONFIG, plane(0))

@@ -236,7 +236,7 @@ def test_a_policy_drives_from_goal_to_goal(maps, eyes):
     terrain, config = files.load(maps / "map_0.npz"), NavigationConfig(speed_range=(0.0, 5.0))
     size = OBSERVATION_SIZE + (math.prod(EMBEDDING_SHAPE) if eyes else 0)
     policy = jax.tree_util.Partial(AtGoal(size))
-    pilot = excitation.Learned(policy, config, eyes, terrain, np.random.default_rng(0))
+    pilot = excitation.Learned(policy, config, eyes, terrain, np.random.default_rng(0), hmmwv())
     state, goals = np.zeros(12, np.float32), []
     for _ in range(3):
         command = pilot(state)
@@ -270,8 +270,8 @@ def test_a_policy_sees_as_far_as_it_did_in_training():
     acted = {}
     for sight in (12.0, np.inf):
         config = NavigationConfig(reveal=RevealConfig(range=sight))
-        routes = excitation._route(config, terrain, goal[:2])
-        known = config, policy, None, terrain, None, routes
+        routes = excitation._route(config, terrain, hmmwv(), goal[:2])
+        known = config, hmmwv(), policy, None, terrain, None, routes
         belief, acted[sight], _ = excitation._act(*known, state, goal, standing)
         assert (belief is None) == np.isinf(sight)
     assert acted[np.inf][0] - acted[12.0][0] > 0.05

@@ -23,6 +23,7 @@ from vertiwm_jax.env.controllers import LookAhead, StraightToGoal
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.evaluation import navigation
+from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.networks.policy import Actor, Senses, SquashedActor
 from vertiwm_jax.rl.experiment import SACTraining
 from vertiwm_jax.rl.learned import Corrected, MeanAction
@@ -90,7 +91,7 @@ def in_onnx(model, seen):
 
 def written(policy, folder):
     """The files of a policy, as on a robot, and the policy in NumPy."""
-    made = export.files(policy, None, CONFIG, 8, onnx_graph.record)
+    made = export.files(policy, None, CONFIG, hmmwv(), 8, onnx_graph.record)
     for name, data in made.items():
         runs.write_atomic(folder / name, data)
     return made, run_policy.load(folder)
@@ -120,7 +121,7 @@ def test_all_forms_of_a_policy_agree(actor, base, tmp_path):
             assert found.dtype == np.float32
             assert np.all(np.abs(found - expected[some]) <= tolerance[some])
     np.testing.assert_allclose(in_numpy(seen[5]), expected[5], atol=1e-5)
-    command = CONFIG.command(jnp.asarray(expected))
+    command = hmmwv().command(jnp.asarray(expected), CONFIG.speed_range)
     speed, steering = in_numpy.command(expected)
     np.testing.assert_allclose(speed, command.speed, atol=1e-6)
     np.testing.assert_allclose(steering, command.steering, atol=1e-6)
@@ -180,21 +181,21 @@ def test_the_observation_of_map_arrays(size, sighted):
     observe, find_way, find_none = (
         jax.export.deserialize(bytearray(data)).call
         for data in (
-            stablehlo.observe(config, eyes),
-            stablehlo.route(config),
-            stablehlo.route(NavigationConfig(reveal=RevealConfig(range=12.0))),
+            stablehlo.observe(config, hmmwv(), eyes),
+            stablehlo.route(config, hmmwv()),
+            stablehlo.route(NavigationConfig(reveal=RevealConfig(range=12.0)), hmmwv()),
         )
     )
     arrays = (*(x[0] for x in arrays), terrain.origin, terrain.resolution)
     worlds = jnp.zeros(1, jnp.int32)
-    routes = route.plan(config.route, terrain, config.chassis, worlds, goal[None, :2])
+    routes = route.plan(config.route, terrain, hmmwv(), worlds, goal[None, :2])
     way = find_way(*arrays, goal)
     np.testing.assert_allclose(way, routes.cost[0], rtol=1e-5)
     straight = route.straight(config.route, terrain, goal[None, :2])
     np.testing.assert_allclose(find_none(*arrays, goal), straight.cost[0], rtol=1e-6)
     assert (way >= straight.cost[0] - 1e-3).all() and (way > 1.5 * straight.cost[0]).any()
     expected = jax.jit(observation.observe, static_argnums=1)(
-        terrain, config.chassis, state, goal, routes, action
+        terrain, hmmwv(), state, goal, routes, action
     )
     assert 0 < (observation.arcs_ahead(expected)[1] == 7.5).sum() < 72
     if eyes:

@@ -7,27 +7,13 @@ import pytest
 
 from vertiwm_jax import config, machine
 from vertiwm_jax.config import ConfigError
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.suites import GroundConfig
-from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import TaskConfig
 from vertiwm_jax.terrain.classes import STANDARD
 
 GROUND = GroundConfig(suites=("easy",), suite_worlds=1, pairs=2)
-
-
-def test_the_hmmwv_is_as_navigation_says():
-    asked = NavigationConfig(chassis=Chassis(steering_limit=0.3))
-    assert TaskConfig(navigation=asked).asked == asked
-
-
-def test_another_vehicle_brings_its_chassis_and_its_steering():
-    rover, found = vehicle.load("rover"), TaskConfig(vehicle="rover").asked
-    assert found.chassis.steering_limit == rover.steering_limit
-    np.testing.assert_allclose(found.chassis.wheelbase, rover.scale * rover.wheelbase, rtol=1e-6)
-    np.testing.assert_allclose(found.chassis.width, rover.scale * rover.width, rtol=1e-6)
 
 
 def test_a_rover_is_tested_on_soil_of_its_scale():
@@ -38,8 +24,8 @@ def test_a_rover_is_tested_on_soil_of_its_scale():
     np.testing.assert_allclose(small.soils.cohesion[0, sand], 10 * ground.soils.cohesion[0, sand])
     test = experiment.test_environment(rover, small)
     assert np.isfinite(test.params.starts.vehicle.vector).all()
-    found = test.params.dynamics.vehicle
-    jax.tree.map(np.testing.assert_array_equal, found, vehicle.load("rover").vehicle)
+    for found in (test.params.dynamics.vehicle, test.params.vehicle):
+        jax.tree.map(np.testing.assert_array_equal, found, vehicle.load("rover").vehicle)
 
 
 @pytest.mark.parametrize(

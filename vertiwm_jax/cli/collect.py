@@ -149,7 +149,7 @@ def record(task: Task) -> Drive:
         rng = np.random.default_rng([command.seed, task.world, task.drive, attempt])
         start = excitation.start(rng, terrain, command.seconds)
         if task.learned:
-            pilot = excitation.Learned(*task.learned, terrain, rng)
+            pilot = excitation.Learned(*task.learned, terrain, rng, task.vehicle)
         else:
             pilot = excitation.sinusoids(rng, command.steps, float(task.vehicle.steering_limit))
         tries.append(recording.record(simulator, terrain, start, pilot, command.steps))
@@ -180,7 +180,7 @@ def _learned(command: Collect) -> tuple[Policy, NavigationConfig, Eyes | None] |
         return None
     config = replace(experiment.load(run / "config.yaml"), vehicle=command.vehicle)
     policy, eyes = jax.device_get(export.restore(config, run, seed=0))
-    return policy, config.asked, eyes
+    return policy, config.navigation, eyes
 
 
 def _claim(command: Collect) -> None:

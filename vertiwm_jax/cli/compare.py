@@ -13,7 +13,7 @@ from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import AtLeastOne, ConfigError, Count
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Agent, Policy
-from vertiwm_jax.env.controllers import REFERENCE, baselines
+from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.suites import SUITES, GroundConfig, Suite
 from vertiwm_jax.evaluation import external, policy_table, report
 from vertiwm_jax.evaluation.external import Arena
@@ -130,7 +130,7 @@ def _judge_all(
     first = settings[config.rows[0]]
     terrain = suites.suite_worlds(config.grounds, key, first.driven.scale)
     rows = [(settings[row], _learned(row, settings[row], folders[row])) for row in config.rows]
-    rows.append((first, lambda _: baselines(first.asked)))
+    rows.append((first, lambda _: first.baselines))
     judged = {}
     for simulator in config.simulators:
         with processes.simulating(config.jobs) as mapped:

@@ -16,7 +16,7 @@ from vertiwm_jax.cli.fit import FitConfig
 from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, settings
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import suites
-from vertiwm_jax.env.controllers import REFERENCE, baselines
+from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.suites import Suite
 from vertiwm_jax.evaluation import (
@@ -263,18 +263,18 @@ def _navigate(command: Navigation) -> None:
     maps, scale = command.worlds, config.driven.scale
     terrain = suites.load(config.ground, maps, scale) if maps else experiment.held_out(config)
     test = external.test_in(command.simulator, config, terrain)
-    policies = baselines(config.asked)
+    policies = config.baselines
     if run:
         # Checkpoints hold episodes, which know as much of the map as in training.
         own = replace(config, navigation=trained.navigation)
         policies = experiment.learned(own, terrain, run) | policies
     elif command.policy == "mppi":
         dynamics, weights = experiment.dynamics(config, command.mppi.model)
-        env = NavigationEnv(dynamics, config.asked)
+        env = NavigationEnv(dynamics, config.navigation)
         policies = {"mppi": MPPI(env=env, dynamics=weights, config=command.mppi)} | policies
     elif command.policy == "shooting":
         dynamics, weights = experiment.dynamics(config, command.shooting.model)
-        env = NavigationEnv(exact(dynamics), config.asked)
+        env = NavigationEnv(exact(dynamics), config.navigation)
         shooting = Shooting(env=env, dynamics=weights, config=command.shooting)
         policies = {"shooting": shooting} | policies
     elif command.policy == "straight":

@@ -16,6 +16,7 @@ from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.deploy import description, run_policy, stablehlo
 from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import TrainConfig
 from vertiwm_jax.rl.learned import Corrected, MeanAction
@@ -43,8 +44,9 @@ def run(name: str, words: Sequence[str]) -> None:
     folder = command.output or command.run / "export"
     record, config = _recorder(), experiment.load(command.run / "config.yaml")
     with runs.new_folder(folder) as unfinished:
+        driven = config.driven.vehicle
         policy, eyes = restore(config, command.run, command.seed)
-        made = files(policy, eyes, config.asked, config.action_repeat, record)
+        made = files(policy, eyes, config.navigation, driven, config.action_repeat, record)
         for file, data in made.items():
             runs.write_atomic(unfinished / file, data)
     print(f"the policy is in {folder}")
@@ -73,15 +75,16 @@ def files(
     policy: Corrected | MeanAction,
     eyes: Eyes | None,
     config: NavigationConfig,
+    vehicle: Vehicle,
     held: int,
     record: Record,
 ) -> dict[str, bytes | str]:
     """What the folder of a policy holds, by name.
 
-    eyes: of a policy that sees embeddings; config, held: as in `description.about`; record:
-    `onnx_graph.record`.
+    eyes: of a policy that sees embeddings; config, vehicle, held: as in `description.about`;
+    record: `onnx_graph.record`.
     """
-    about, weights = description.about(policy, config, held), description.weights(policy)
+    about, weights = description.about(policy, config, vehicle, held), description.weights(policy)
     arrays = io.BytesIO()
     np.savez(arrays, allow_pickle=False, **weights)
     size = about["observation"]["size"]
@@ -91,8 +94,8 @@ def files(
         "policy.onnx": record(partial(run_policy.act, about, weights), size, 2),
         # The key is not used: no learned policy is random.
         "policy.stablehlo": stablehlo.policy(lambda seen: policy(seen, jax.random.key(0)), size),
-        "route.stablehlo": stablehlo.route(config),
-        "observe.stablehlo": stablehlo.observe(config, eyes),
+        "route.stablehlo": stablehlo.route(config, vehicle),
+        "observe.stablehlo": stablehlo.observe(config, vehicle, eyes),
         "run_policy.py": Path(run_policy.__file__).read_bytes(),
     }
 

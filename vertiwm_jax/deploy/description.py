@@ -14,22 +14,27 @@ from vertiwm_jax.env.controllers import REFERENCE, LookAhead, StraightToGoal
 from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, LAYOUT, Part
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.traversability import TraversabilityCost
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.networks.policy import SquashedActor
 from vertiwm_jax.rl import normalise
 from vertiwm_jax.rl.learned import Corrected, MeanAction
 from vertiwm_jax.state import STEP_SECONDS, Command
 from vertiwm_jax.terrain.classes import STANDARD
 
+_SIZES = "length", "width", "wheelbase", "track", "ride_height", "steering_limit"
 _BASES = {LookAhead: "look ahead", StraightToGoal: REFERENCE}
 
 
-def about(policy: Corrected | MeanAction, config: NavigationConfig, held: int) -> dict[str, Any]:
+def about(
+    policy: Corrected | MeanAction, config: NavigationConfig, vehicle: Vehicle, held: int
+) -> dict[str, Any]:
     """What the numbers of a policy mean, for JSON.
 
-    config: of the environment; held: steps for which its actions were held while it learned.
+    config: of the environment; vehicle: what drives; held: steps for which its
+    actions were held while it learned.
     """
-    places, heading = observation.poses_ahead(config.chassis)
-    standing = config.action(Command(jnp.float32(0), jnp.float32(0)))
+    places, heading = observation.poses_ahead(vehicle)
+    still = Command(jnp.float32(0), jnp.float32(0))
     base = policy.base if isinstance(policy, Corrected) else None
     size, parts = observation.OBSERVATION_SIZE, LAYOUT
     image = _learned(policy).actor.senses.image
@@ -49,8 +54,8 @@ def about(policy: Corrected | MeanAction, config: NavigationConfig, held: int) -
         },
         "action": {
             "speed_range": config.speed_range,
-            "steering_limit": config.chassis.steering_limit,
-            "standing": standing.tolist(),
+            "steering_limit": float(vehicle.steering_limit),
+            "standing": vehicle.action(still, config.speed_range).tolist(),
         },
         "arcs": {"steering": ARC_STEERING.tolist(), "stations": ARC_STATIONS.tolist()},
         "network": {
@@ -59,7 +64,7 @@ def about(policy: Corrected | MeanAction, config: NavigationConfig, held: int) -
             "squashed": isinstance(_learned(policy).actor, SquashedActor),
         },
         "base": None if base is None else {"name": _BASES[type(base)], **_numbers(base)},
-        "vehicle": dataclasses.asdict(config.chassis),
+        "vehicle": {name: float(getattr(vehicle, name)) for name in _SIZES},
         "ground_classes": STANDARD.names,
     }
 
@@ -87,6 +92,7 @@ def _numbers(base: Any) -> dict[str, Any]:
     """The settings of a controller, but for the environment's."""
     own = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
     del own["config"]
+    own.pop("steering_limit", None)  # that of the vehicle
     return {
         name: dataclasses.asdict(value) if isinstance(value, TraversabilityCost) else value
         for name, value in own.items()

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jax import export
 
 from vertiwm_jax.env import observation
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.route import Routes
 from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.classes import STANDARD
 from vertiwm_jax.terrain.map import TerrainMap
@@ -26,27 +26,27 @@ def policy(act: Callable[[jax.Array], jax.Array], size: int) -> bytes:
     return _serialised(act, _floats(batch, size))
 
 
-def route(config: NavigationConfig) -> bytes:
+def route(config: NavigationConfig, vehicle: Vehicle) -> bytes:
     """The route to a goal over map arrays of any size; the arguments of `_route`."""
-    return _serialised(partial(_route, config), *_map_arrays(), _floats(3))
+    return _serialised(partial(_route, config, vehicle), *_map_arrays(), _floats(3))
 
 
-def observe(config: NavigationConfig, eyes: Eyes | None) -> bytes:
+def observe(config: NavigationConfig, vehicle: Vehicle, eyes: Eyes | None) -> bytes:
     """`observation.observe` of map arrays, for maps of any size; the arguments of `_observe`.
 
     With eyes, the observation ends with what they see.
     """
     seen = _floats(config.route.cells, config.route.cells), _floats(12), _floats(3), _floats(2)
-    return _serialised(partial(_observe, config.chassis, eyes), *_map_arrays(), *seen)
+    return _serialised(partial(_observe, vehicle, eyes), *_map_arrays(), *seen)
 
 
-def _route(config: NavigationConfig, *arguments: jax.Array) -> jax.Array:
+def _route(config: NavigationConfig, vehicle: Vehicle, *arguments: jax.Array) -> jax.Array:
     """`[n, n]` m to the goal `[3]`, which follows the arguments of `_terrain`."""
     *arrays, goal = arguments
-    return config.route_to(_terrain(*arrays), goal[:2]).cost[0]
+    return config.route_to(_terrain(*arrays), vehicle, goal[:2]).cost[0]
 
 
-def _observe(chassis: Chassis, eyes: Eyes | None, *arguments: jax.Array) -> jax.Array:
+def _observe(driven: Vehicle, eyes: Eyes | None, *arguments: jax.Array) -> jax.Array:
     """`[O]` seen on one world, given by the arguments of `_terrain`; what follows them:
 
     route: `[n, n]`, of `_route`; state: `[12]`, as `VehicleState.vector`; goal: `[3]` m; action:
@@ -55,7 +55,7 @@ def _observe(chassis: Chassis, eyes: Eyes | None, *arguments: jax.Array) -> jax.
     *arrays, cost, state, goal, action = arguments
     terrain, vehicle = _terrain(*arrays), VehicleState.from_vector(state)
     route = Routes(cost[None], jnp.int32(0))
-    seen = observation.observe(terrain, chassis, vehicle, goal, route, action)
+    seen = observation.observe(terrain, driven, vehicle, goal, route, action)
     return observation.with_embedding(seen, eyes(terrain, vehicle).latent) if eyes else seen
 
 

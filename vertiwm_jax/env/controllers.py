@@ -9,17 +9,17 @@ from vertiwm_jax.env.agent import Policy
 from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, GOAL, ROUTE_SCALE, arcs_ahead
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.traversability import TraversabilityCost
-from vertiwm_jax.state import Command
+from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
 
 REFERENCE = "straight to goal"
 """The baseline whose failures tell which tasks are hard."""
 
 
-def baselines(config: NavigationConfig) -> dict[str, Policy]:
+def baselines(config: NavigationConfig, vehicle: Vehicle) -> dict[str, Policy]:
     """The policies of this file, by the names of their rows in a table."""
     return {
         "look ahead": LookAhead(config),
-        REFERENCE: StraightToGoal(config),
+        REFERENCE: StraightToGoal(config, float(vehicle.steering_limit)),
         "random": RandomActions(),
     }
 
@@ -28,19 +28,22 @@ def baselines(config: NavigationConfig) -> dict[str, Policy]:
 class StraightToGoal:
     """Holds one speed and steers at the goal, blind to the ground.
 
-    config: of the environment, which says what actions mean.
+    config: of the environment, which says what actions mean; steering_limit: of the vehicle, rad.
     speed: m/s. gain: steering angle for each rad of bearing.
     """
 
     config: NavigationConfig = struct.field(pytree_node=False)
+    steering_limit: float = struct.field(
+        pytree_node=False, default_factory=lambda: float(hmmwv().steering_limit)
+    )
     speed: float = 4.0
     gain: float = 1.0
 
     def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """`[..., O]` observation to `[..., 2]` action; the key is not used."""
         _, cos, sin = jnp.moveaxis(observation[..., GOAL], -1, 0)
-        steering = self.gain * jnp.arctan2(sin, cos)
-        return self.config.action(Command(jnp.full_like(steering, self.speed), steering))
+        steering = self.gain * jnp.arctan2(sin, cos) / self.steering_limit
+        return _at_speed(self.config, self.speed, steering)
 
 
 @struct.dataclass
@@ -70,8 +73,7 @@ class LookAhead:
         cost = jnp.sum(hard * np.exp(-ARC_STATIONS / self.reach), axis=-1)
         left = ROUTE_SCALE * jnp.mean(route[..., slice(*self.far)], axis=-1)
         share = jax.nn.softmax(-(cost + self.onward * left) / self.spread, axis=-1)
-        steering = self.config.chassis.steering_limit * jnp.sum(share * ARC_STEERING, axis=-1)
-        return self.config.action(Command(jnp.full_like(steering, self.speed), steering))
+        return _at_speed(self.config, self.speed, jnp.sum(share * ARC_STEERING, axis=-1))
 
 
 @struct.dataclass
@@ -81,3 +83,12 @@ class RandomActions:
     def __call__(self, observation: jax.Array, key: jax.Array) -> jax.Array:
         """`[..., O]` observation to `[..., 2]` action."""
         return jax.random.uniform(key, (*observation.shape[:-1], 2), minval=-1.0, maxval=1.0)
+
+
+def _at_speed(config: NavigationConfig, speed: float, steering: jax.Array) -> jax.Array:
+    """`[..., 2]` actions of a speed, m/s, and of a steering `[...]`, 1 at full lock."""
+    low, high = config.speed_range
+    action = jnp.stack(
+        [jnp.full_like(steering, (speed - low) / (high - low) * 2 - 1), steering], -1
+    )
+    return jnp.clip(action, -1.0, 1.0)

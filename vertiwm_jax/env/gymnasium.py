@@ -112,7 +112,7 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             float(vehicle.rpy[2]),
             state.goal,
             config.goal_radius,
-            config.chassis,
+            self._params.vehicle,
         )
 
     def _start(self) -> tuple[jax.Array, TaskState]:

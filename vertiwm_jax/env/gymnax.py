@@ -15,6 +15,7 @@ import jax
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import NavigationConfig, TaskParams
 from vertiwm_jax.env.tasks import random_tasks
+from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.worlds import WorldConfig
 from vertiwm_jax.world_model.choice import ModelName, choose, lean
@@ -53,7 +54,7 @@ class ProceduralNavigation(NavigationEnv):
         """Drawn and settled anew whenever asked for, in seconds: keep them, and pass them on."""
         world_key, task_key = jax.random.split(jax.random.key(self.seed))
         terrain = worlds.generate(jax.random.split(world_key, self.number), self.relief)
-        tasks = random_tasks(task_key, terrain, self.starts, self.config.chassis)
+        tasks = random_tasks(task_key, terrain, self.starts, hmmwv())
         return self.make_params(choose(self.model)[1], terrain, tasks)
 
 

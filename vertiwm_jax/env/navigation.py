@@ -7,7 +7,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from gymnax.environments import environment, spaces
 
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE, Dynamics, Params, disagreement, spread, step
@@ -18,9 +17,10 @@ from vertiwm_jax.env.reward import reward
 from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState, see
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason, edge_distance, first_ending, is_terminal
+from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
 from vertiwm_jax.networks.policy import Senses
 from vertiwm_jax.state import STEP_SECONDS, VehicleState
-from vertiwm_jax.terrain import obstacles, patches, query, reveal
+from vertiwm_jax.terrain import obstacles, query, reveal
 from vertiwm_jax.terrain.map import TerrainMap
 
 
@@ -36,27 +36,32 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
     config: NavigationConfig = dataclasses.field(default_factory=NavigationConfig)
     variation: RandomizationConfig = RandomizationConfig()
 
-    def __post_init__(self) -> None:
-        chassis = self.config.chassis
-        reach = float(np.hypot(chassis.wheelbase, chassis.track)) / 2
-        top_speed = max(abs(speed) for speed in self.config.speed_range)
-        patches.footprint_covered(reach, top_speed)
-
-    def make_params(self, dynamics: Params, terrain: TerrainMap, tasks: Tasks) -> TaskParams:
+    def make_params(
+        self, dynamics: Params, terrain: TerrainMap, tasks: Tasks, vehicle: Vehicle | None = None
+    ) -> TaskParams:
         """Parameters whose pool of starts is `tasks`, each settled on the ground by the model.
 
-        `ValueError` names the first task that cannot be driven, or whose settled state is not
-        finite.
-        """
-        return self._starts.settled(dynamics, terrain, tasks)
+        Args:
+            dynamics: the model's parameters.
+            terrain: the worlds.
+            tasks: on these worlds.
+            vehicle: what the model moves; an HMMWV by default.
 
-    def shapes(self, dynamics: Params, terrain: TerrainMap, tasks: Tasks) -> TaskParams:
+        Raises:
+            ValueError: names the first task that cannot be driven, or whose settled state is not
+                finite.
+        """
+        return self._pool.settled(dynamics, vehicle or hmmwv(), terrain, tasks)
+
+    def shapes(
+        self, dynamics: Params, terrain: TerrainMap, tasks: Tasks, vehicle: Vehicle | None = None
+    ) -> TaskParams:
         """What `make_params` gives, but for the starts, of which only shapes are known.
 
         Enough to restore what was learned with such parameters, or to compile what will be, without
         settling anything. Tasks that cannot be driven raise as there.
         """
-        return self._starts.shapes(dynamics, terrain, tasks)
+        return self._pool.shapes(dynamics, vehicle or hmmwv(), terrain, tasks)
 
     def start(self, params: TaskParams, index: jax.Array) -> tuple[jax.Array, TaskState]:
         """Observation and state of start `[]` of the pool."""
@@ -86,7 +91,10 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         terrain = params.terrain.select(state.world)
         action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
         arriving, variation = state.variation.arriving(action)
-        ground, command = state.variation.ground(terrain), config.command(arriving)
+        ground, command = (
+            state.variation.ground(terrain),
+            params.vehicle.command(arriving, config.speed_range),
+        )
         moved, history = step(
             self.dynamics, params.dynamics, ground, state.history, state.vehicle, command
         )
@@ -106,15 +114,13 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         distance, _ = observation.distance_and_bearing(vehicle.position, state.goal)
         roll, pitch, yaw = vehicle.rpy
         xy = vehicle.position[:2]
-        chassis = config.chassis
+        size = params.vehicle.length, params.vehicle.width
         ending = first_ending(
             {
                 TerminationReason.TIMED_OUT: time >= params.max_steps_in_episode,
                 TerminationReason.GOAL: distance < config.goal_radius,
                 TerminationReason.STUCK: stalled * STEP_SECONDS >= config.stuck_seconds,
-                TerminationReason.COLLIDED: obstacles.collides(
-                    terrain, xy, yaw, chassis.length, chassis.width
-                ),
+                TerminationReason.COLLIDED: obstacles.collides(terrain, xy, yaw, *size),
                 TerminationReason.OFF_MAP: edge_distance(terrain, xy) < config.map_margin,
                 TerminationReason.ROLLED_OVER: jnp.maximum(jnp.abs(roll), jnp.abs(pitch))
                 > config.rollover_angle,
@@ -170,7 +176,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         """`[O]` float32, see `observation.observe`, and the model's embedding of the ground."""
         del key, action
         routes = params.routes.select(state.route)
-        return see(self.config, params.believed(state), routes, state)
+        return see(self.config, params.believed(state), params.vehicle, routes, state)
 
     def is_terminated(self, state: TaskState, params: TaskParams) -> jax.Array:
         """Whether the task itself is over."""
@@ -201,7 +207,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         return Senses(observation.ARCS, EMBEDDING_SHAPE if self.config.embeddings else None)
 
     @property
-    def _starts(self) -> ResetPool:
+    def _pool(self) -> ResetPool:
         return ResetPool(self.dynamics, self.config, self.variation)
 
     def _is_plausible(

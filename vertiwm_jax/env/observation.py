@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.route import CLEARANCE, Routes
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.env.traversability import CROWN_SCALE, SLOPE_SCALE, TWIST_SCALE, footprint, places
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.networks.policy import Candidates, tiles
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import obstacles, query
@@ -116,21 +116,19 @@ ARCS = Candidates(_split, tuple((0.0, float(steering)) for steering in ARC_STEER
 """The arcs as candidates of a policy: each stands for its steering."""
 
 
-def poses_ahead(chassis: Chassis) -> tuple[np.ndarray, np.ndarray]:
+def poses_ahead(vehicle: Vehicle) -> tuple[jax.Array, jax.Array]:
     """Poses on the arcs, in the yaw frame: x, y in m `[P, 2]` and heading in rad `[P]`."""
-    curvature = np.tan(chassis.steering_limit * ARC_STEERING)[:, None] / chassis.wheelbase
-    distance = ARC_STATIONS * chassis.wheelbase
-    heading = curvature * distance
+    distance = ARC_STATIONS * vehicle.wheelbase
+    heading = vehicle.curvature(ARC_STEERING)[:, None] * distance
     # sinc is exact for the straight arc, where the radius is infinite.
-    chord = distance * np.sinc(heading / (2 * np.pi))
-    xy = np.stack([chord * np.cos(heading / 2), chord * np.sin(heading / 2)], axis=-1)
-    here = np.zeros((1, 2)), np.zeros(1)
-    return np.concatenate([here[0], xy.reshape(-1, 2)]), np.append(here[1], heading)
+    chord = distance * jnp.sinc(heading / (2 * jnp.pi))
+    xy = jnp.stack([chord * jnp.cos(heading / 2), chord * jnp.sin(heading / 2)], axis=-1)
+    return jnp.pad(xy.reshape(-1, 2), [(1, 0), (0, 0)]), jnp.pad(heading.ravel(), (1, 0))
 
 
 def observe(
     terrain: TerrainMap,
-    chassis: Chassis,
+    vehicle: Vehicle,
     state: VehicleState,
     goal: jax.Array,
     routes: Routes,
@@ -162,15 +160,15 @@ def observe(
     )
 
     # Written out: a matmul may round map coordinates to ten bits on an accelerator.
-    def at(points: np.ndarray | jax.Array) -> jax.Array:
+    def at(points: jax.Array) -> jax.Array:
         x, y = points[..., 0], points[..., 1]
         east, north = state.position[:2]
         return jnp.stack([east + (cos * x - sin * y), north + (sin * x + cos * y)], axis=-1)
 
-    place, heading = poses_ahead(chassis)
+    place, heading = poses_ahead(vehicle)
     xy = at(place)
-    under = footprint(chassis, query.height(terrain, at(places(chassis, place, heading))))
-    size = chassis.length + 2 * CLEARANCE, chassis.width + 2 * CLEARANCE
+    under = footprint(vehicle, query.height(terrain, at(places(vehicle, place, heading))))
+    size = vehicle.length + 2 * CLEARANCE, vehicle.width + 2 * CLEARANCE
     blocked = obstacles.collides(terrain, xy, yaw + heading, *size)
     # Heights repeat beyond the edge of the map, which would look like the best of roads.
     blocked |= edge_distance(terrain, xy) < 0

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.terrain.map import TerrainMap
 
 _PIXELS_A_VERTEX = 4
@@ -56,7 +56,7 @@ def from_above(
     yaw: float,
     goal: np.ndarray,
     goal_radius: float,
-    chassis: Chassis,
+    vehicle: Vehicle,
 ) -> np.ndarray:
     """`[H, W, 3]` uint8, north up: the vehicle as a red box with a white nose, the goal a ring."""
     picture = shaded(terrain, world)
@@ -69,7 +69,7 @@ def from_above(
     picture[ring] = _GOAL
     ahead = np.cos(yaw) * (x - position[0]) + np.sin(yaw) * (y - position[1])
     left = np.cos(yaw) * (y - position[1]) - np.sin(yaw) * (x - position[0])
-    body = (np.abs(ahead) <= chassis.length / 2) & (np.abs(left) <= chassis.width / 2)
+    body = (np.abs(ahead) <= vehicle.length / 2) & (np.abs(left) <= vehicle.width / 2)
     picture[body] = _VEHICLE
-    picture[body & (ahead > chassis.length / 4)] = 1.0
+    picture[body & (ahead > vehicle.length / 4)] = 1.0
     return (255 * picture).round().astype(np.uint8)

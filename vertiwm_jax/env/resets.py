@@ -14,8 +14,9 @@ from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConf
 from vertiwm_jax.env.route import Routes
 from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState, see
 from vertiwm_jax.env.tasks import TaskError, Tasks
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
-from vertiwm_jax.terrain import query, reveal
+from vertiwm_jax.terrain import patches, query, reveal
 from vertiwm_jax.terrain.map import TerrainMap
 
 _Placed = tuple[VehicleState, History]
@@ -33,18 +34,20 @@ class ResetPool:
     config: NavigationConfig
     variation: RandomizationConfig
 
-    def settled(self, weights: Params, terrain: TerrainMap, pool: Tasks) -> TaskParams:
+    def settled(
+        self, weights: Params, vehicle: Vehicle, terrain: TerrainMap, pool: Tasks
+    ) -> TaskParams:
         """As `NavigationEnv.make_params`."""
         config = self.config
-        self._check(terrain, pool)
+        self._check(vehicle, terrain, pool)
         if config.reveal.partial:
             routes = route.straight(config.route, terrain, pool.goal)
         else:
-            routes = route.plan(config.route, terrain, config.chassis, pool.world, pool.goal)
+            routes = route.plan(config.route, terrain, vehicle, pool.world, pool.goal)
         together, numbered = _in_turns(pool)
         settle = parallel.shared_out(partial(_settle_once, self), together)
         states, seen = parallel.in_turns(
-            lambda some: settle(weights, terrain, routes, *some), numbered, together
+            lambda some: settle(weights, vehicle, terrain, routes, *some), numbered, together
         )
         finite = np.all(np.isfinite(states.vehicle.vector), axis=-1)
         if not finite.all():
@@ -55,11 +58,13 @@ class ResetPool:
                 f"{int(pool.world[i])}, start {np.asarray(pool.start)[i].tolist()}); "
                 f"{np.sum(~finite)} of {finite.size} tasks are so"
             )
-        return self._params(weights, terrain, routes, states, seen)
+        return self._params(weights, vehicle, terrain, routes, states, seen)
 
-    def shapes(self, weights: Params, terrain: TerrainMap, pool: Tasks) -> TaskParams:
+    def shapes(
+        self, weights: Params, vehicle: Vehicle, terrain: TerrainMap, pool: Tasks
+    ) -> TaskParams:
         """As `NavigationEnv.shapes`."""
-        self._check(terrain, pool)
+        self._check(vehicle, terrain, pool)
         routes = route.straight(self.config.route, terrain, pool.goal)
         together, numbered = _in_turns(pool)
         some = jax.tree.map(lambda x: x[:together], numbered)
@@ -67,18 +72,21 @@ class ResetPool:
         shapes = parallel.shapes(partial(_settle, self), together)
         states, seen = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct((len(pool.world), *x.shape[1:]), x.dtype),
-            shapes(weights, terrain, routes, *some),
+            shapes(weights, vehicle, terrain, routes, *some),
         )
-        return self._params(weights, terrain, routes, states, seen)
+        return self._params(weights, vehicle, terrain, routes, states, seen)
 
-    def _check(self, terrain: TerrainMap, pool: Tasks) -> None:
-        """`ValueError` names what cannot be revealed, or the first task that cannot be driven."""
+    def _check(self, vehicle: Vehicle, terrain: TerrainMap, pool: Tasks) -> None:
+        """`ValueError` names what cannot be seen, or the first task that cannot be driven."""
+        reach = float(np.hypot(vehicle.wheelbase, vehicle.track)) / 2
+        patches.footprint_covered(reach, max(map(abs, self.config.speed_range)))
         reveal.check(self.config.reveal, terrain)
         tasks.validate(pool, terrain, self.config.goal_radius, self.config.map_margin)
 
     def _params(
         self,
         weights: Params,
+        vehicle: Vehicle,
         terrain: TerrainMap,
         routes: Routes,
         states: TaskState,
@@ -87,6 +95,7 @@ class ResetPool:
         return TaskParams(
             max_steps_in_episode=jnp.int32(round(self.config.horizon_seconds / STEP_SECONDS)),
             dynamics=weights,
+            vehicle=jax.tree.map(jnp.asarray, vehicle),
             terrain=terrain,
             routes=routes,
             starts=states,
@@ -105,6 +114,7 @@ def _in_turns(pool: Tasks) -> tuple[int, tuple[Tasks, jax.Array]]:
 def _settle(
     starts: ResetPool,
     dynamics: Params,
+    vehicle: Vehicle,
     terrain: TerrainMap,
     routes: Routes,
     pool: Tasks,
@@ -118,24 +128,29 @@ def _settle(
         # Made where it is used: from outside of what devices share, it would be another type.
         return Command(jnp.float32(0), jnp.float32(0))
 
-    def place(dynamics: Params, terrain: TerrainMap, task: Tasks) -> _Placed:
+    def place(dynamics: Params, vehicle: Vehicle, terrain: TerrainMap, task: Tasks) -> _Placed:
         selected = terrain.select(task.world)
-        vehicle = tasks.place(selected, config.chassis, task.start, task.yaw)
-        return vehicle, model.init(dynamics, selected, vehicle)
+        state = tasks.place(selected, vehicle, task.start, task.yaw)
+        return state, model.init(dynamics, selected, state)
 
     def stand(dynamics: Params, terrain: TerrainMap, world: jax.Array, placed: _Placed) -> _Placed:
-        vehicle, history = placed
-        return step(model, dynamics, terrain.select(world), history, vehicle, standing())
+        state, history = placed
+        return step(model, dynamics, terrain.select(world), history, state, standing())
 
     def start(
-        terrain: TerrainMap, routes: Routes, task: Tasks, number: jax.Array, settled: _Placed
+        vehicle: Vehicle,
+        terrain: TerrainMap,
+        routes: Routes,
+        task: Tasks,
+        number: jax.Array,
+        settled: _Placed,
     ) -> tuple[TaskState, jax.Array]:
-        vehicle, history = settled
+        at_rest, history = settled
         selected = terrain.select(task.world)
-        zero, action = jnp.int32(0), config.action(standing())
+        zero, action = jnp.int32(0), vehicle.action(standing(), config.speed_range)
         state = TaskState(
             time=zero,
-            vehicle=vehicle,
+            vehicle=at_rest,
             history=history,
             world=task.world,
             goal=jnp.append(task.goal, query.height(selected, task.goal)),
@@ -144,20 +159,20 @@ def _settle(
             stalled=zero,
             ending=zero,
             variation=DomainRandomization.draw(starts.variation, jax.random.key(0), action),
-            belief=reveal.begin(config.reveal, selected, vehicle.position, vehicle.rpy[2]),
+            belief=reveal.begin(config.reveal, selected, at_rest.position, at_rest.rpy[2]),
         )
         believed = dataclasses.replace(selected, belief=state.belief)
-        return state, see(config, believed, routes.select(number), state)
+        return state, see(config, believed, vehicle, routes.select(number), state)
 
-    placed = parallel.vmap(place, (None, None, 0))(dynamics, terrain, pool)
+    placed = parallel.vmap(place, (None, None, None, 0))(dynamics, vehicle, terrain, pool)
     # Steps of all, and not all steps of each: inside of `vmap`, a scan is traced again until it is
     # known what of a history differs between vehicles.
     stand_all = partial(parallel.vmap(stand, (None, None, 0, 0)), dynamics, terrain, pool.world)
     settled, _ = jax.lax.scan(
         lambda placed, _: (stand_all(placed), None), placed, length=config.settle_steps
     )
-    start_all = parallel.vmap(start, (None, None, 0, 0, 0))
-    return start_all(terrain, routes, pool, numbers, settled)
+    start_all = parallel.vmap(start, (None, None, None, 0, 0, 0))
+    return start_all(vehicle, terrain, routes, pool, numbers, settled)
 
 
 # Apart, for what is traced inside of something else, as for its shapes, has no compiler options.

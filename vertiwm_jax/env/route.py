@@ -16,9 +16,9 @@ from flax import struct
 
 from vertiwm_jax import parallel
 from vertiwm_jax.config import Bounds, NotNegative, settings
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.env.traversability import TraversabilityCost, footprint, places
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -83,18 +83,18 @@ class Routes:
 
 
 def plan(
-    config: RouteConfig, terrain: TerrainMap, chassis: Chassis, world: jax.Array, goal: jax.Array
+    config: RouteConfig, terrain: TerrainMap, vehicle: Vehicle, world: jax.Array, goal: jax.Array
 ) -> Routes:
     """Routes to goals `[P, 2]`, m, in worlds `[P]`; all devices work at them."""
-    of_worlds = parallel.shared_out(functools.partial(_all_costs, config, chassis), terrain.worlds)
-    costs = of_worlds(terrain, jnp.arange(terrain.worlds))
+    of_worlds = parallel.shared_out(functools.partial(_all_costs, config), terrain.worlds)
+    costs = of_worlds(vehicle, terrain, jnp.arange(terrain.worlds))
     to_goals = parallel.shared_out(_all_costs_to_go, len(world))
     return Routes(to_goals(terrain, costs, world, goal), jnp.int32(0))
 
 
-def plan_one(config: RouteConfig, terrain: TerrainMap, chassis: Chassis, goal: jax.Array) -> Routes:
+def plan_one(config: RouteConfig, terrain: TerrainMap, vehicle: Vehicle, goal: jax.Array) -> Routes:
     """The route to the goal `[2]`, m, in the selected world; can be compiled."""
-    costs = _costs(config, chassis, terrain, terrain.world)
+    costs = _costs(config, vehicle, terrain, terrain.world)
     route = _costs_to_go(terrain, costs[None], jnp.int32(0), goal)
     return Routes(route[None], jnp.int32(0))
 
@@ -105,13 +105,13 @@ def straight(config: RouteConfig, terrain: TerrainMap, goal: jax.Array) -> Route
     return Routes(jnp.linalg.norm(offset, axis=-1), jnp.int32(0))
 
 
-@functools.partial(jax.jit, static_argnames=("config", "chassis"))
+@functools.partial(jax.jit, static_argnames="config")
 def _all_costs(
-    config: RouteConfig, chassis: Chassis, terrain: TerrainMap, world: jax.Array
+    config: RouteConfig, vehicle: Vehicle, terrain: TerrainMap, world: jax.Array
 ) -> jax.Array:
     """`[W, 16, n, n]`"""
-    each = parallel.vmap(functools.partial(_costs, config, chassis), (None, 0), _TOGETHER)
-    return each(terrain, world)
+    each = parallel.vmap(functools.partial(_costs, config), (None, None, 0), _TOGETHER)
+    return each(vehicle, terrain, world)
 
 
 @jax.jit
@@ -124,7 +124,7 @@ def _all_costs_to_go(
 
 
 def _costs(
-    config: RouteConfig, chassis: Chassis, terrain: TerrainMap, world: jax.Array
+    config: RouteConfig, vehicle: Vehicle, terrain: TerrainMap, world: jax.Array
 ) -> jax.Array:
     """`[16, n, n]` m of level ground that moves from cells cost, those of `_MOVES` and back."""
     terrain = terrain.select(world)
@@ -133,11 +133,11 @@ def _costs(
     on_the_way = (_PLACES[:, None, None] * move)[:, :, None, None]
     xy = _middles(terrain, config.cells) + on_the_way  # [3, 8, n, n, 2]
     heading = jnp.broadcast_to(heading[:, None, None], xy.shape[:-1])
-    ground = footprint(chassis, query.height(terrain, places(chassis, xy, heading)))
+    ground = footprint(vehicle, query.height(terrain, places(vehicle, xy, heading)))
     hard = config.difficulty(ground.crown, ground.rise, ground.bank, ground.twist)
-    size = chassis.length + 2 * CLEARANCE, chassis.width + 2 * CLEARANCE
+    size = vehicle.length + 2 * CLEARANCE, vehicle.width + 2 * CLEARANCE
     blocked = obstacles.collides(terrain, xy[1], heading[1], *size)
-    blocked |= edge_distance(terrain, xy[1]) < chassis.length / 2
+    blocked |= edge_distance(terrain, xy[1]) < vehicle.length / 2
     each = 1 + config.detour * jnp.mean(hard, axis=0) + config.blocked * blocked
     there = length[:, None, None] * each
     # A move back is as hard as the one there, which begins where it ends.

@@ -11,8 +11,8 @@ import numpy as np
 
 from vertiwm_jax import froude
 from vertiwm_jax.config import AtLeastOne, ConfigError, Count, CountOrZero, NotNegative, settings
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.tasks import Tasks, circle_tasks, random_tasks
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.terrain import files, vertibench, worlds
 from vertiwm_jax.terrain.map import TerrainMap, stack
 from vertiwm_jax.terrain.worlds import MEDIAN_SLOPE_DEG, WorldConfig
@@ -96,10 +96,10 @@ def load(config: GroundConfig, path: Path, scale: float = 1.0) -> TerrainMap:
 
 
 def training_tasks(
-    config: GroundConfig, terrain: TerrainMap, chassis: Chassis, key: jax.Array
+    config: GroundConfig, terrain: TerrainMap, vehicle: Vehicle, key: jax.Array
 ) -> Tasks:
     """Random tasks and those across the circle of every world."""
-    parts = (random_tasks(key, terrain, config.starts, chassis), test_tasks(config, terrain))
+    parts = (random_tasks(key, terrain, config.starts, vehicle), test_tasks(config, terrain))
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from gymnax.environments import environment
@@ -15,11 +14,11 @@ from vertiwm_jax.dynamics import (
     embedding,
 )
 from vertiwm_jax.env import observation, route
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.randomization import DomainRandomization
 from vertiwm_jax.env.reward import RewardConfig
 from vertiwm_jax.env.route import RouteConfig, Routes
-from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.reveal import RevealConfig
@@ -55,7 +54,6 @@ class NavigationConfig:
     plausible_disagreement: float = np.inf
     settle_steps: int = 15
     embeddings: bool = False
-    chassis: Chassis = dataclasses.field(default_factory=Chassis)
     reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
     route: RouteConfig = RouteConfig()
     reveal: RevealConfig = RevealConfig()
@@ -67,25 +65,11 @@ class NavigationConfig:
                 f"found {self.reveal.range:g}"
             )
 
-    def route_to(self, terrain: TerrainMap, goal: jax.Array) -> Routes:
-        """The route to the goal `[2]`, m, in the selected world; can be compiled."""
+    def route_to(self, terrain: TerrainMap, vehicle: Vehicle, goal: jax.Array) -> Routes:
+        """The vehicle's route to the goal `[2]`, m, in the selected world; can be compiled."""
         if self.reveal.partial:
             return route.straight(self.route, terrain, goal[None])
-        return route.plan_one(self.route, terrain, self.chassis, goal)
-
-    def command(self, action: jax.Array) -> Command:
-        """`[..., 2]` action, clipped to [-1, 1], to the command it stands for."""
-        action = jnp.clip(action, -1.0, 1.0)
-        low, high = self.speed_range
-        speed = low + (action[..., 0] + 1) / 2 * (high - low)
-        return Command(speed, action[..., 1] * self.chassis.steering_limit)
-
-    def action(self, command: Command) -> jax.Array:
-        """The `[..., 2]` action of a command, clipped to [-1, 1]; the inverse of `command`."""
-        low, high = self.speed_range
-        speed = (command.speed - low) / (high - low) * 2 - 1
-        steering = command.steering / self.chassis.steering_limit
-        return jnp.clip(jnp.stack([speed, steering], -1), -1.0, 1.0)
+        return route.plan_one(self.route, terrain, vehicle, goal)
 
 
 @struct.dataclass(kw_only=True)
@@ -117,13 +101,14 @@ class TaskState(environment.EnvState):
 class TaskParams(environment.EnvParams):
     """What an environment is run with: arrays, so that nothing here is compiled in.
 
-    dynamics: the model's parameters.
+    dynamics: the model's parameters. vehicle: what drives; its model should know the same.
     terrain: all worlds; routes: to all goals of the pool.
     starts, start_observation: leaves `[P, ...]` and `[P, O]`, the pool that resets draw from.
     max_steps_in_episode: `[]` int32.
     """
 
     dynamics: Params
+    vehicle: Vehicle
     terrain: TerrainMap
     routes: Routes
     starts: TaskState
@@ -148,14 +133,17 @@ class TaskParams(environment.EnvParams):
 
 
 def see(
-    config: NavigationConfig, terrain: TerrainMap, routes: Routes, state: TaskState
+    config: NavigationConfig,
+    terrain: TerrainMap,
+    vehicle: Vehicle,
+    routes: Routes,
+    state: TaskState,
 ) -> jax.Array:
     """`[O]` float32, see `observation.observe`, and the model's embedding of the ground.
 
     terrain: as far as the vehicle has seen it; routes: with that to its goal selected.
     """
-    chassis, vehicle = config.chassis, state.vehicle
-    seen = observation.observe(terrain, chassis, vehicle, state.goal, routes, state.action)
+    seen = observation.observe(terrain, vehicle, state.vehicle, state.goal, routes, state.action)
     if not config.embeddings:
         return seen
     return observation.with_embedding(seen, embedding(state.history))

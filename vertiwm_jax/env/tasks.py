@@ -10,11 +10,11 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax import xla
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.geometry import wrap
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -124,14 +124,14 @@ def random_tasks(
     key: jax.Array,
     terrain: TerrainMap,
     count: int,
-    chassis: Chassis,
+    vehicle: Vehicle,
     config: RandomTaskConfig = RandomTaskConfig(),
 ) -> Tasks:
     """`count` random tasks, spread evenly over the worlds.
 
     `ValueError` if for some task no candidate was acceptable.
     """
-    tasks, found = _draw(key, terrain, count, chassis, config)
+    tasks, found = _draw(key, terrain, count, vehicle, config)
     missing = int(count - found.sum())
     if missing:
         worlds = np.unique(np.asarray(tasks.world)[~np.asarray(found)])
@@ -143,9 +143,9 @@ def random_tasks(
     return tasks
 
 
-@functools.partial(xla.brief_jit, static_argnames=("count", "chassis", "config"))
+@functools.partial(xla.brief_jit, static_argnames=("count", "config"))
 def _draw(
-    key: jax.Array, terrain: TerrainMap, count: int, chassis: Chassis, config: RandomTaskConfig
+    key: jax.Array, terrain: TerrainMap, count: int, vehicle: Vehicle, config: RandomTaskConfig
 ) -> tuple[Tasks, jax.Array]:
     rows, columns = terrain.elevation.shape[-2:]
     extent = jnp.array([columns - 1, rows - 1]) * terrain.resolution
@@ -165,11 +165,11 @@ def _draw(
         )
         distance = jnp.linalg.norm(offset, axis=-1)
         near_enough = (distance >= config.distance[0]) & (distance <= config.distance[1])
-        length = chassis.length + 2 * config.clearance
-        width = chassis.width + 2 * config.clearance
+        length = vehicle.length + 2 * config.clearance
+        width = vehicle.width + 2 * config.clearance
 
         def is_acceptable(i: jax.Array) -> jax.Array:
-            roll, pitch, _ = place(selected, chassis, start[i], yaw[i]).rpy
+            roll, pitch, _ = place(selected, vehicle, start[i], yaw[i]).rpy
             tilt = jnp.arccos(jnp.cos(roll) * jnp.cos(pitch))
             level = slope_around(selected, start[i]) <= config.roughest_start
             ends = jnp.stack([start[i], goal[i]])
@@ -187,9 +187,9 @@ def _draw(
     return jax.lax.map(draw, (jax.random.split(key, count), world), batch_size=_DRAWN_TOGETHER)
 
 
-def place(terrain: TerrainMap, chassis: Chassis, xy: jax.Array, yaw: jax.Array) -> VehicleState:
+def place(terrain: TerrainMap, vehicle: Vehicle, xy: jax.Array, yaw: jax.Array) -> VehicleState:
     """A vehicle standing at `[2]` xy and `[]` yaw, laid on the ground under its four wheels."""
-    sizes = (chassis.wheelbase, chassis.track, chassis.axle_height)
+    sizes = (vehicle.wheelbase, vehicle.track, vehicle.ride_height)
     position, rpy = rest_on_ground(terrain, xy, yaw, *map(jnp.float32, sizes))
     still = jnp.zeros(3)
     return VehicleState(position, rpy, still, still)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax.env.chassis import Chassis
+from vertiwm_jax.mechanics.vehicle import Vehicle
 
 SLOPE_SCALE = 0.4
 TWIST_SCALE = 0.2
@@ -32,26 +32,26 @@ class Footprint:
 
 
 def places(
-    chassis: Chassis, xy: jax.Array | np.ndarray, heading: jax.Array | np.ndarray
+    vehicle: Vehicle, xy: jax.Array | np.ndarray, heading: jax.Array | np.ndarray
 ) -> jax.Array:
     """The middles and wheels of vehicles at `[..., 2]`, m, with `[...]` heading: `[5, ..., 2]`."""
     cos, sin = jnp.cos(heading), jnp.sin(heading)
-    forward = jnp.stack([cos, sin], axis=-1) * chassis.wheelbase / 2
-    left = jnp.stack([-sin, cos], axis=-1) * chassis.track / 2
+    forward = jnp.stack([cos, sin], axis=-1) * vehicle.wheelbase / 2
+    left = jnp.stack([-sin, cos], axis=-1) * vehicle.track / 2
     corners = (forward + left, forward - left, -forward + left, -forward - left)
     return jnp.stack([xy, *(xy + corner for corner in corners)])
 
 
-def footprint(chassis: Chassis, heights: jax.Array) -> Footprint:
+def footprint(vehicle: Vehicle, heights: jax.Array) -> Footprint:
     """Of heights `[5, ...]`, m, at `places`."""
     middle, fl, fr, rl, rr = heights
     mean = (fl + fr + rl + rr) / 4
     return Footprint(
         mean=mean,
         crown=(middle - mean) / CROWN_SCALE,
-        rise=(fl + fr - rl - rr) / (2 * chassis.wheelbase * SLOPE_SCALE),
-        bank=(fl + rl - fr - rr) / (2 * chassis.track * SLOPE_SCALE),
-        twist=(fl + rr - fr - rl) / (2 * chassis.track * TWIST_SCALE),
+        rise=(fl + fr - rl - rr) / (2 * vehicle.wheelbase * SLOPE_SCALE),
+        bank=(fl + rl - fr - rr) / (2 * vehicle.track * SLOPE_SCALE),
+        twist=(fl + rr - fr - rl) / (2 * vehicle.track * TWIST_SCALE),
     )
 
 

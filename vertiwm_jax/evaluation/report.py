@@ -15,7 +15,7 @@ import numpy as np
 from vertiwm_jax import machine, runs
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Agent, Policy
-from vertiwm_jax.env.controllers import REFERENCE, baselines
+from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import TaskParams
 from vertiwm_jax.env.termination import TerminationReason
@@ -59,7 +59,7 @@ def after_training(trained: Trained) -> str:
     plots.save(figure, folder / "learning_curves.png")
     machine.forget_programs()  # Tests need the memory.
     test = experiment.test_environment(config, trained.held_out)
-    policies = trained.policies | baselines(config.asked)
+    policies = trained.policies | config.baselines
     groups = drive(test.env, test.params, policies, config.key("testing"))
     write(folder, groups, REFERENCE, test.params.terrain, config.navigation.goal_radius)
     return markdown(groups, REFERENCE)

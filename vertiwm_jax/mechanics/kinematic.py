@@ -51,7 +51,7 @@ def bicycle_of(vehicle: Vehicle, speed_lag: float = 0.2) -> BicycleParams:
     return BicycleParams(
         wheelbase=jnp.asarray(vehicle.wheelbase),
         track=jnp.asarray(vehicle.track),
-        ride_height=jnp.asarray(vehicle.wheel_radius - vehicle.travel_at_rest.mean()),
+        ride_height=jnp.asarray(vehicle.ride_height),
         speed_lag=jnp.float32(speed_lag),
     )
 

@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import froude
 from vertiwm_jax.config import Positive, settings
+from vertiwm_jax.state import Command
 
 GRAVITY = 9.81
 HMMWV = "hmmwv"
@@ -79,10 +81,35 @@ class Vehicle:
         return self.wheel_position[0, 1] - self.wheel_position[1, 1]
 
     @property
+    def ride_height(self) -> jax.Array:
+        """`[]` m from level ground to the body origin of a vehicle that stands on its springs."""
+        return self.wheel_radius - self.travel_at_rest.mean()
+
+    @property
     def travel_at_rest(self) -> jax.Array:
         """`[4]` m, height of the wheel centres in the body where the springs carry the weight."""
         load = self.mass * GRAVITY / 4
         return self.free_travel + (load - self.wheel_weight) / self.spring
+
+    def command(self, action: jax.Array, speed_range: tuple[float, float]) -> Command:
+        """The command that `[..., 2]` actions in [-1, 1], clipped to that, stand for.
+
+        speed_range: commanded speed in m/s at actions -1 and 1.
+        """
+        action = jnp.clip(action, -1.0, 1.0)
+        low, high = speed_range
+        speed = low + (action[..., 0] + 1) / 2 * (high - low)
+        return Command(speed, action[..., 1] * self.steering_limit)
+
+    def action(self, command: Command, speed_range: tuple[float, float]) -> jax.Array:
+        """The `[..., 2]` action of a command, clipped to [-1, 1]; the inverse of `command`."""
+        low, high = speed_range
+        speed = (command.speed - low) / (high - low) * 2 - 1
+        return jnp.clip(jnp.stack([speed, command.steering / self.steering_limit], -1), -1.0, 1.0)
+
+    def curvature(self, steering: jax.Array | np.ndarray) -> jax.Array:
+        """`[...]` 1/m of the arcs driven at a steering in [-1, 1], left positive."""
+        return jnp.tan(self.steering_limit * steering) / self.wheelbase
 
 
 @settings

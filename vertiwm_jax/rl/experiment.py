@@ -13,11 +13,9 @@ from vertiwm_jax import machine
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import Count
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.env import suites, tasks
+from vertiwm_jax.env import controllers, suites, tasks
 from vertiwm_jax.env.action_repeat import ActionRepeat, Controller
 from vertiwm_jax.env.agent import Agent, Policy
-from vertiwm_jax.env.chassis import Chassis
-from vertiwm_jax.env.controllers import baselines
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.randomization import RandomizationConfig
 from vertiwm_jax.env.suites import GroundConfig
@@ -80,7 +78,7 @@ class TaskConfig:
     ground: GroundConfig = GroundConfig()
     """What worlds and tasks."""
     navigation: NavigationConfig = NavigationConfig()
-    """What the task is; a vehicle other than the HMMWV brings a chassis of its own."""
+    """What the task is."""
     variation: RandomizationConfig = RandomizationConfig()
     """How episodes differ from what map and model say, while learning."""
     model: ModelName = "builtin"
@@ -110,11 +108,9 @@ class TaskConfig:
         return vehicle.load(self.vehicle)
 
     @property
-    def asked(self) -> NavigationConfig:
-        """`navigation` for the vehicle."""
-        if self.vehicle == HMMWV:
-            return self.navigation
-        return replace(self.navigation, chassis=Chassis.of(self.driven.vehicle))
+    def baselines(self) -> dict[str, Policy]:
+        """The controllers that policies are compared with and may correct."""
+        return controllers.baselines(self.navigation, self.driven.vehicle)
 
     def key(self, purpose: Literal["worlds", "tasks", "training", "testing"]) -> jax.Array:
         """The random key of one purpose."""
@@ -157,7 +153,7 @@ class TrainConfig(TaskConfig, ABC):
     @property
     def controller(self) -> Controller | None:
         """What the policy corrects."""
-        return None if self.base == "none" else baselines(self.asked)[self.base]
+        return None if self.base == "none" else self.baselines[self.base]
 
     def repeated(self, env: NavigationEnv) -> ActionRepeat:
         """The task as algorithms see it."""
@@ -234,12 +230,13 @@ def training_ground(config: TaskConfig) -> tuple[TerrainMap, Tasks, TerrainMap]:
 
     Maps that cannot be used, and tasks that cannot be driven on them, raise `ValueError`.
     """
-    navigation, scale = config.asked, config.driven.scale
-    terrain, held_out = suites.grounds(config.ground, config.worlds, config.key("worlds"), scale)
+    navigation, driven = config.navigation, config.driven
+    key = config.key("worlds")
+    terrain, held_out = suites.grounds(config.ground, config.worlds, key, driven.scale)
     # Now, and not when the training is over.
     tests = suites.test_tasks(config.ground, held_out)
     tasks.validate(tests, held_out, navigation.goal_radius, navigation.map_margin)
-    pool = suites.training_tasks(config.ground, terrain, navigation.chassis, config.key("tasks"))
+    pool = suites.training_tasks(config.ground, terrain, driven.vehicle, config.key("tasks"))
     return terrain, pool, held_out
 
 
@@ -265,8 +262,8 @@ def environment(
 ) -> Task:
     """Tasks inside one of the models."""
     moves, params = dynamics(config, model)
-    env = NavigationEnv(moves, config.asked, variation)
-    return Task(env, env.make_params(params, terrain, pool))
+    env = NavigationEnv(moves, config.navigation, variation)
+    return Task(env, env.make_params(params, terrain, pool, config.driven.vehicle))
 
 
 def dynamics(config: TaskConfig, model: Imagined) -> tuple[Dynamics, Params]:
@@ -313,8 +310,8 @@ def run(config: TrainConfig) -> Trained:
     terrain, pool, held_out = training_ground(config)
     machine.forget_programs()
     moves, weights = dynamics(config, config.model)
-    env = NavigationEnv(moves, config.asked, config.variation)
-    shapes = env.shapes(weights, terrain, pool)
+    env = NavigationEnv(moves, config.navigation, config.variation)
+    shapes = env.shapes(weights, terrain, pool, config.driven.vehicle)
     algorithm, schedule, seeds = config.algorithm(env), config.schedule, config.loop.seeds
     steps = schedule.collected * config.action_repeat
     restored = loop.restore(algorithm, shapes, config.resume, seeds) if config.resume else None
@@ -322,7 +319,7 @@ def run(config: TrainConfig) -> Trained:
         # Now, while there are no vehicles yet that fill the memory.
         loop.prepare(algorithm, shapes, seeds, schedule.shareable)
     _log.info("placing vehicles for %s tasks ...", f"{len(pool.world):,}")
-    params = env.make_params(weights, terrain, pool)
+    params = env.make_params(weights, terrain, pool, config.driven.vehicle)
     machine.forget_programs()
     with Run.begin(config, config.name, restored[0] if restored else 0, config.wandb) as begun:
         _log.info("run folder %s", begun.folder)
@@ -348,8 +345,9 @@ def learned(config: TrainConfig, terrain: TerrainMap, run: Path) -> Rows:
     terrain: any worlds that tests can be drawn on.
     """
     moves, weights = dynamics(config, config.model)
-    env = NavigationEnv(moves, config.asked, config.variation)
-    params = env.shapes(weights, terrain, suites.test_tasks(config.ground, terrain))
+    env = NavigationEnv(moves, config.navigation, config.variation)
+    tests = suites.test_tasks(config.ground, terrain)
+    params = env.shapes(weights, terrain, tests, config.driven.vehicle)
     algorithm = config.algorithm(env)
     restored = loop.restore(algorithm, params, run, config.loop.seeds)
     if restored is None:
@@ -368,7 +366,7 @@ def _policies(config: TrainConfig, algorithm: Learning, params: TaskParams, stat
         if config.planning:
             moves, weights = dynamics(config, config.planning.model)
             rows[f"{name} with planning"] = Planner(
-                env=NavigationEnv(moves, config.asked),
+                env=NavigationEnv(moves, config.navigation),
                 dynamics=weights,
                 policy=policy,
                 value=algorithm.value(params, of_seed),

@@ -87,7 +87,8 @@ class Imagining(Agent):
     ) -> tuple[jax.Array, Plan]:
         """The base, corrected as planned; the model's history follows the vehicle."""
         action = corrected(self.base, observation, key, memory.corrections[0])
-        terrain, command = params.believed(state), self.env.config.command(action)
+        terrain = params.believed(state)
+        command = params.vehicle.command(action, self.env.config.speed_range)
         given = self.dynamics, terrain, memory.history, state.vehicle, command
         _, history = step(self.env.dynamics, *given)
         return action, replace(memory, history=history)

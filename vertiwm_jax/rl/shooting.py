@@ -13,6 +13,7 @@ from vertiwm_jax.env.observation import distance_and_bearing
 from vertiwm_jax.env.reward import ending_reward
 from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason, edge_distance
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.rl.imagining import Plan, around
 from vertiwm_jax.rl.open_loop import OpenLoop, OpenLoopConfig
 from vertiwm_jax.terrain import obstacles
@@ -124,7 +125,7 @@ class Shooting(OpenLoop):
             ended = ending_reward(reward, after.ending, distance)
             gain = gain - jnp.where(before.ending == TerminationReason.RUNNING, ended, 0.0)
             remains = jnp.float32(1)
-            for ending, share in self._nearness(terrain, after, distance).items():
+            for ending, share in self._nearness(terrain, params.vehicle, after, distance).items():
                 gain = gain + share * ending_reward(reward, jnp.int32(ending), distance)
                 remains = remains * (1 - share)
             return (after, weight * discount * remains, total + weight * gain), None
@@ -135,14 +136,13 @@ class Shooting(OpenLoop):
         return total + weight * self.expected(params, end)
 
     def _nearness(
-        self, terrain: TerrainMap, state: TaskState, distance: jax.Array
+        self, terrain: TerrainMap, vehicle: Vehicle, state: TaskState, distance: jax.Array
     ) -> dict[TerminationReason, jax.Array]:
         """`[]` from 0 to 1 for endings at a distance or an angle, 1/2 where the task draws them."""
         config, position = self.env.config, state.vehicle.position[:2]
         roll, pitch, yaw = state.vehicle.rpy
         tilt = jnp.maximum(jnp.abs(roll), jnp.abs(pitch))
-        chassis = config.chassis
-        gap = obstacles.gap(terrain, position, yaw, chassis.length, chassis.width)
+        gap = obstacles.gap(terrain, position, yaw, vehicle.length, vehicle.width)
         beyond = {
             TerminationReason.GOAL: (config.goal_radius - distance) / self.config.clearance,
             TerminationReason.COLLIDED: -gap / self.config.clearance,

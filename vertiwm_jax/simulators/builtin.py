@@ -1,7 +1,5 @@
 """The built-in simulator as a source of drives."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +7,6 @@ from flax import struct
 
 from vertiwm_jax import geometry
 from vertiwm_jax.env import tasks
-from vertiwm_jax.env.chassis import Chassis
 from vertiwm_jax.learning.dataset import Auxiliary
 from vertiwm_jax.mechanics.simulator import (
     GroundForces,
@@ -43,12 +40,11 @@ class BuiltIn:
 
     def __init__(self, terrain: TerrainMap, vehicle: Vehicle | None = None) -> None:
         self._terrain, self._params = terrain, chrono_like(vehicle or hmmwv())
-        self._chassis = Chassis.of(vehicle) if vehicle else Chassis()
 
     def start(self, x: float, y: float, yaw: float) -> Observation:
         """As `Simulator.start`."""
         pose = np.array([x, y, yaw], np.float32)
-        self._moving = _place(self._params, self._terrain, self._chassis, pose)
+        self._moving = _place(self._params, self._terrain, pose)
         for _ in range(round(SETTLE_SECONDS / STEP_SECONDS) - 1):
             self.step(np.zeros(2))
         return self.step(np.zeros(2))
@@ -60,11 +56,9 @@ class BuiltIn:
         return jax.device_get(seen)
 
 
-@partial(jax.jit, static_argnames="chassis")
-def _place(
-    params: SimulatorParams, terrain: TerrainMap, chassis: Chassis, pose: jax.Array
-) -> _Moving:
-    state = tasks.place(terrain, chassis, pose[:2], pose[2])
+@jax.jit
+def _place(params: SimulatorParams, terrain: TerrainMap, pose: jax.Array) -> _Moving:
+    state = tasks.place(terrain, params.vehicle, pose[:2], pose[2])
     history, none = DYNAMICS.init(params, terrain, state), jnp.zeros((4, 3))
     return _Moving(state, history, GroundForces(none, none[0]))
 

@@ -12,6 +12,7 @@ from vertiwm_jax.env.agent import Policy
 from vertiwm_jax.env.route import Routes
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import edge_distance
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query, reveal
@@ -95,10 +96,11 @@ class Learned:
     eyes: Eyes | None
     terrain: TerrainMap
     rng: np.random.Generator
+    vehicle: Vehicle
 
     def __post_init__(self) -> None:
         standing = Command(jnp.float32(0), jnp.float32(0))
-        self._action = np.asarray(self.config.action(standing))
+        self._action = np.asarray(self.vehicle.action(standing, self.config.speed_range))
         self._goal: np.ndarray | None = None
         self._routes: Routes | None = None
         self._belief: MapBelief | None = None
@@ -108,8 +110,16 @@ class Learned:
         goal = self._goal
         if goal is None or np.linalg.norm(goal - state[:3]) < self.config.goal_radius:
             self._goal = goal = self._draw_goal(state[:2])
-            self._routes = _route(self.config, self.terrain, goal[:2])
-        own = self.config, self.policy, self.eyes, self.terrain, self._belief, self._routes
+            self._routes = _route(self.config, self.terrain, self.vehicle, goal[:2])
+        own = (
+            self.config,
+            self.vehicle,
+            self.policy,
+            self.eyes,
+            self.terrain,
+            self._belief,
+            self._routes,
+        )
         self._belief, self._action, command = jax.device_get(_act(*own, state, goal, self._action))
         return command
 
@@ -122,13 +132,16 @@ class Learned:
 
 
 @jax.jit(static_argnames="config")
-def _route(config: NavigationConfig, terrain: TerrainMap, goal: jax.Array) -> Routes:
-    return config.route_to(terrain, goal)
+def _route(
+    config: NavigationConfig, terrain: TerrainMap, vehicle: Vehicle, goal: jax.Array
+) -> Routes:
+    return config.route_to(terrain, vehicle, goal)
 
 
 @jax.jit(static_argnames="config")
 def _act(
     config: NavigationConfig,
+    driven: Vehicle,
     policy: Policy,
     eyes: Eyes | None,
     terrain: TerrainMap,
@@ -146,12 +159,12 @@ def _act(
     else:
         belief = reveal.look(config.reveal, terrain, belief, *pose)
     terrain = replace(terrain, belief=belief)
-    seen = observation.observe(terrain, config.chassis, vehicle, goal, routes, action)
+    seen = observation.observe(terrain, driven, vehicle, goal, routes, action)
     if eyes:
         seen = observation.with_embedding(seen, eyes(terrain, vehicle).latent)
     # No learned policy is random.
     action = jnp.clip(policy(seen, jax.random.key(0)), -1.0, 1.0)
-    return belief, action, config.command(action).vector
+    return belief, action, driven.command(action, config.speed_range).vector
 
 
 @jax.jit

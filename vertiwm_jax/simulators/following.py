@@ -61,7 +61,7 @@ def move(
     simulator: Simulator, env: NavigationEnv, params: TaskParams, action: jax.Array
 ) -> TaskParams:
     """Does the action `[2]` in `simulator`; `Followed` does the same with these parameters."""
-    seen = simulator.step(np.asarray(env.config.command(action).vector))
+    seen = simulator.step(np.asarray(params.vehicle.command(action, env.config.speed_range).vector))
     return _moved(params, jnp.asarray(seen.state))
 
 

@@ -8,7 +8,11 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 
 def collides(
-    terrain: TerrainMap, xy: jax.Array, yaw: jax.Array, length: float, width: float
+    terrain: TerrainMap,
+    xy: jax.Array,
+    yaw: jax.Array,
+    length: float | jax.Array,
+    width: float | jax.Array,
 ) -> jax.Array:
     """Whether rectangles centred at `[..., 2]` with `[...]` yaw touch an obstacle: `[...]` bool.
 
@@ -18,7 +22,11 @@ def collides(
 
 
 def gap(
-    terrain: TerrainMap, xy: jax.Array, yaw: jax.Array, length: float, width: float
+    terrain: TerrainMap,
+    xy: jax.Array,
+    yaw: jax.Array,
+    length: float | jax.Array,
+    width: float | jax.Array,
 ) -> jax.Array:
     """`[...]` m between the rectangles of `collides` and the nearest obstacle; inf without any.
 

@@ -25,7 +25,7 @@ def drive(
     driver = policy if isinstance(policy, Agent) else Reactive(policy)
     observation, state = env.start(params, jax.numpy.int32(0))
     memory = driver.start(params, state)
-    rows = [_row(env, state)]
+    rows = [_row(env, params, state)]
     for step in range(int(params.max_steps_in_episode)):
         if state.ending != TerminationReason.RUNNING:
             break
@@ -35,7 +35,7 @@ def drive(
         memory, observation, state = _advance(
             env, driver, params, memory, observation, state, keys[1:]
         )
-        rows.append(_row(env, state))
+        rows.append(_row(env, params, state))
     vehicle, command, wheels, alpha = jax.tree.map(lambda *x: np.stack(x), *rows)
     ending = TerminationReason(int(state.ending)).name.lower().replace("_", " ")
     return Scene(
@@ -50,9 +50,9 @@ def drive(
     )
 
 
-def _row(env: NavigationEnv, state: TaskState) -> tuple:
+def _row(env: NavigationEnv, params: TaskParams, state: TaskState) -> tuple:
     """What is kept of a step: the state, the command that led there, wheels and coefficients."""
-    command = env.config.command(state.action).vector
+    command = params.vehicle.command(state.action, env.config.speed_range).vector
     alpha = getattr(state.history, "coefficients", None)
     return jax.device_get((state.vehicle.vector, command, modelled(state.history), alpha))
 
