@@ -2,28 +2,31 @@
 
 import ast
 import dataclasses
+import enum
+import importlib
 import inspect
-import pkgutil
 import re
 import textwrap
 import types
 import typing
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-import vertiwm_jax
+from vertiwm_jax import config as configuration_files
 from vertiwm_jax.cli.collect import Collect
 from vertiwm_jax.cli.compare import CompareConfig
 from vertiwm_jax.cli.fit import FitConfig
 from vertiwm_jax.cli.make_logs import MakeLogs
+from vertiwm_jax.config import default_config
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.rl.experiment import PPOTraining, SACTraining, TD3Training
 
+FILES = {"ppo": "ppo", "sac": "sac", "td3": "td3", "fit": "fit_chrono", "compare": "table3"}
+"""The YAML file that each of these commands reads if it is told no other."""
 COMMANDS = {
     "ppo": PPOTraining,
     "sac": SACTraining,
@@ -36,12 +39,69 @@ COMMANDS = {
     "collect --vehicle": VehicleConfig,
 }
 
+PACKAGE = "vertiwm_jax"
+PUBLIC = {
+    "State and motion": (
+        "vertiwm_jax.state.VehicleState",
+        "vertiwm_jax.state.Command",
+        "vertiwm_jax.dynamics.Dynamics",
+        "vertiwm_jax.dynamics.rollout",
+        "vertiwm_jax.env.tasks.place",
+    ),
+    "Ground": (
+        "vertiwm_jax.terrain.map.TerrainMap",
+        "vertiwm_jax.terrain.map.build",
+        "vertiwm_jax.terrain.map.stack",
+        "vertiwm_jax.terrain.files.load",
+        "vertiwm_jax.terrain.files.from_heightmap",
+        "vertiwm_jax.terrain.files.save",
+        "vertiwm_jax.terrain.worlds.generate",
+        "vertiwm_jax.terrain.worlds.WorldConfig",
+        "vertiwm_jax.terrain.classes.GroundClasses",
+        "vertiwm_jax.terrain.soil.Soil",
+    ),
+    "Vehicles and models": (
+        "vertiwm_jax.mechanics.vehicle.Vehicle",
+        "vertiwm_jax.mechanics.vehicle.load",
+        "vertiwm_jax.world_model.choice.choose",
+        "vertiwm_jax.world_model.model.VertiWM",
+    ),
+    "Recorded drives": (
+        "vertiwm_jax.learning.dataset.load",
+        "vertiwm_jax.learning.dataset.Drives",
+        "vertiwm_jax.learning.pipeline.fit",
+        "vertiwm_jax.evaluation.prediction.predict",
+        "vertiwm_jax.adaptation.soil_filter.SoilFilter",
+    ),
+    "The task": (
+        "vertiwm_jax.env.navigation.NavigationEnv",
+        "vertiwm_jax.env.task.NavigationConfig",
+        "vertiwm_jax.env.task.TaskParams",
+        "vertiwm_jax.env.reward.RewardConfig",
+        "vertiwm_jax.env.termination.TerminationReason",
+        "vertiwm_jax.env.tasks.circle_tasks",
+        "vertiwm_jax.env.tasks.random_tasks",
+        "vertiwm_jax.env.gymnasium.NavigationGymEnv",
+    ),
+    "Policies and planners": (
+        "vertiwm_jax.env.agent.Agent",
+        "vertiwm_jax.rl.ppo.PPO",
+        "vertiwm_jax.rl.ppo.PPOConfig",
+        "vertiwm_jax.rl.sac.SACConfig",
+        "vertiwm_jax.rl.td3.TD3Config",
+        "vertiwm_jax.rl.mppi.MPPI",
+        "vertiwm_jax.rl.shooting.Shooting",
+        "vertiwm_jax.evaluation.navigation.evaluate",
+        "vertiwm_jax.evaluation.navigation.NavigationResult",
+    ),
+}
+"""What others may build on."""
+
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Called by MkDocs once it knows the pages that are written by hand."""
     files.append(File.generated(config, "configuration.md", content=configuration()))
-    for name, content in api():
-        files.append(File.generated(config, f"api/{name}.md", content=content))
+    files.append(File.generated(config, "api.md", content=api()))
     return files
 
 
@@ -50,9 +110,12 @@ def configuration() -> str:
     lines = [
         "# Configuration",
         "",
-        "Settings are frozen dataclasses. YAML files and command lines name their fields with dots "
-        "(`--ppo.num-envs 512`); what a file of `configs/` says comes before these defaults.",
+        "After this page you know every setting of every command, and what it is if you do not set "
+        "it. YAML files and command lines name settings with dots (`--ppo.num-envs 512`). A "
+        "command reads a YAML file of `configs/` unless `--config` names another; where that file "
+        "sets a value, it stands in the column *default* in bold, with the file's name.",
     ]
+    shipped = _shipped()
     found: dict[type, None] = {}
     for kind in COMMANDS.values():
         found |= dict.fromkeys(_nested(kind))
@@ -68,24 +131,111 @@ def configuration() -> str:
             _first_line(kind),
             "",
         ]
-        lines += ["| setting | type | default | what |", "|---|---|---|---|", *_rows(kind)]
+        lines += ["| setting | type | default | what |", "|---|---|---|---|", *_rows(kind, shipped)]
     return "\n".join(lines) + "\n"
 
 
-def api() -> Iterator[tuple[str, str]]:
-    """A page for each package and one for the modules that belong to none."""
-    root = Path(vertiwm_jax.__file__).parent
-    modules = list(pkgutil.iter_modules([str(root)]))
-    commands = [module.name for module in modules if not module.ispkg]
-    yield "vertiwm_jax", _page("vertiwm_jax", [f"vertiwm_jax.{name}" for name in commands])
-    for package in (module.name for module in modules if module.ispkg):
-        inside = pkgutil.iter_modules([str(root / package)])
-        names = [f"vertiwm_jax.{package}.{module.name}" for module in inside]
-        yield package, _page(f"vertiwm_jax.{package}", names)
+def api() -> str:
+    """Every public name: its signature, what it says of itself, and its public methods."""
+    lines = [
+        "# API",
+        "",
+        "After this page you know how each public name is called. Arrays are named by their axes: "
+        "`[..., 12]` has any leading axes. Units are SI, angles are radians; frames are those of "
+        "[geometry and state](method/geometry.md). Everything that is not listed here may change "
+        "without notice.",
+    ]
+    for group, names in PUBLIC.items():
+        lines += ["", f"## {group}"]
+        for path in names:
+            module, _, name = path.rpartition(".")
+            lines += _documented(path, getattr(importlib.import_module(module), name))
+    return "\n".join(lines) + "\n"
 
 
-def _page(title: str, modules: list[str]) -> str:
-    return "\n\n".join([f"# {title}", *(f"::: {module}" for module in modules)]) + "\n"
+def _documented(path: str, thing: Any) -> Iterator[str]:
+    yield from ("", f"### {path.rpartition('.')[2]} {{ #{path.replace('.', '-').lower()} }}", "")
+    yield from (f"`{path}`", "", "```python", _signature(thing.__name__, thing), "```", "")
+    yield from _told_in_markdown(thing)
+    for name, method in vars(thing).items() if inspect.isclass(thing) else ():
+        function = getattr(method, "__func__", getattr(method, "func", method))
+        if name.startswith("_"):
+            continue
+        if isinstance(method, property):
+            yield from ("", f"`{thing.__name__}.{name}`: {inspect.getdoc(method) or ''}", "")
+        elif not getattr(function, "__module__", "").startswith(PACKAGE):
+            continue
+        elif inspect.isfunction(function):
+            yield from (
+                "",
+                "```python",
+                _signature(f"{thing.__name__}.{name}", function),
+                "```",
+                "",
+            )
+            yield from _told_in_markdown(function)
+
+
+def _signature(name: str, thing: Any) -> str:
+    if inspect.isclass(thing) and issubclass(thing, (enum.Enum, typing.Protocol)):  # pyright: ignore
+        return f"class {name}"
+    parts: list[str] = []
+    signature = inspect.signature(thing)
+    for parameter in signature.parameters.values():
+        if parameter.kind is parameter.KEYWORD_ONLY and not any(x[0] == "*" for x in parts):
+            parts.append("*")
+        if parameter.name not in ("self", "cls"):
+            parts.append(_parameter(parameter))
+    back = signature.return_annotation
+    back = "" if inspect.isclass(thing) or back is signature.empty else f" -> {_annotation(back)}"
+    line = f"{name}({', '.join(parts)}){back}"
+    return line if len(line) < 100 else f"{name}(\n    " + ",\n    ".join(parts) + f",\n){back}"
+
+
+def _parameter(parameter: inspect.Parameter) -> str:
+    stars = {parameter.VAR_POSITIONAL: "*", parameter.VAR_KEYWORD: "**"}.get(parameter.kind, "")
+    text, default = stars + parameter.name, parameter.default
+    if parameter.annotation is not parameter.empty:
+        text += f": {_annotation(parameter.annotation)}"
+    if default is parameter.empty:
+        return text
+    plain = not dataclasses.is_dataclass(default) and not hasattr(default, "shape")
+    shown = repr(default) if plain and "<" not in repr(default) else f"{type(default).__name__}()"
+    return f"{text} = {shown}"
+
+
+def _annotation(kind: Any) -> str:
+    text = kind.__name__ if isinstance(kind, type) and not typing.get_args(kind) else str(kind)
+    return re.sub(r"\b([A-Za-z_]\w*[.])+", "", "None" if text == "NoneType" else text)
+
+
+SECTION = re.compile(r"^(Args|Returns|Raises|Attributes):$")
+ENTRY = re.compile(r"^(\w+(?:, \w+)*): ")
+
+
+def _told_in_markdown(thing: Any) -> Iterator[str]:
+    """A docstring, whose lines `name: meaning` become a list, as do those of its sections."""
+    names = set(inspect.signature(thing).parameters)
+    inside = in_list = False
+    for line in (inspect.getdoc(thing) or "").splitlines():
+        if section := SECTION.match(line):
+            inside, in_list = True, False
+            yield from ("", f"**{section[1]}**", "")
+            continue
+        inside = inside and (line.startswith(" ") or not line)
+        text = line[4:] if inside else line
+        entry = ENTRY.match(text)
+        if entry and (inside or names & set(entry[1].split(", "))):
+            if not in_list:
+                yield ""
+            in_list = True
+            yield f"* `{entry[1].replace(', ', '`, `')}`: {text[entry.end() :]}"
+        elif in_list and text.strip():
+            yield f"  {text.strip()}"
+        else:
+            in_list = False
+            yield text
+    yield ""
 
 
 def _nested(kind: type) -> Iterator[type]:
@@ -97,11 +247,44 @@ def _nested(kind: type) -> Iterator[type]:
                 yield from _nested(part)
 
 
-def _rows(kind: type) -> Iterator[str]:
+def _shipped() -> dict[tuple[type, str], list[str]]:
+    """What shipped files set fields to, where that is not their default, and which files do."""
+    found: dict[tuple[type, str], dict[str, dict[str, list[str]]]] = {}
+    for command, name in FILES.items():
+        config = configuration_files.load(COMMANDS[command], default_config(name))
+        for path, parent, field in _fields(config):
+            value = _default(field, getattr(parent, field.name))
+            if value != _default(field):
+                values = found.setdefault((type(parent), field.name), {})
+                values.setdefault(value, {}).setdefault(f"{name}.yaml", []).append(path)
+    return {field: list(_told(values)) for field, values in found.items()}
+
+
+def _told(values: dict[str, dict[str, list[str]]]) -> Iterator[str]:
+    for value, files in values.items():
+        where = [
+            f"{file} ({', '.join(paths)})" if len(paths) > 1 or len(values) > 1 else file
+            for file, paths in files.items()
+        ]
+        yield f"**{value}** in {', '.join(where)}"
+
+
+def _fields(config: Any, path: str = "") -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
+    """Of a configuration and those in it: where it is, the configuration, and a field of it."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _fields(value, f"{path}.{field.name}".strip("."))
+        else:
+            yield path, config, field
+
+
+def _rows(kind: type, shipped: dict[tuple[type, str], list[str]]) -> Iterator[str]:
     meanings, hints = _meanings(kind), typing.get_type_hints(kind)
     for field in dataclasses.fields(kind):
         of_it = hints[field.name]
-        cells = (f"`{field.name}`", _type(of_it), _default(field))
+        values = [_default(field), *shipped.get((kind, field.name), [])]
+        cells = (f"`{field.name}`", _type(of_it), "; ".join(values))
         text = " ".join(meanings.get(field.name, "").split())
         if not text and dataclasses.is_dataclass(of_it) and isinstance(of_it, type):
             text = _first_line(of_it)
@@ -127,8 +310,11 @@ def _anchor(kind: type) -> str:
     return f"settings-{kind.__module__}-{kind.__name__}".replace(".", "-").lower()
 
 
-def _default(field: dataclasses.Field[Any]) -> str:
-    if field.default is not dataclasses.MISSING:
+def _default(field: dataclasses.Field[Any], given: Any = dataclasses.MISSING) -> str:
+    """Of a field, or another value that it is given."""
+    if given is not dataclasses.MISSING:
+        value = given
+    elif field.default is not dataclasses.MISSING:
         value = field.default
     elif field.default_factory is not dataclasses.MISSING:
         value = field.default_factory()

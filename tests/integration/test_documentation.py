@@ -1,6 +1,7 @@
 """What the documentation shows is true: its examples run, and its commands exist."""
 
 import importlib
+import importlib.util
 import os
 import re
 import shlex
@@ -197,3 +198,15 @@ def test_a_command_that_does_not_exist_would_be_found(reading):
         main("collect", ["--output", "drives"])
     assert read.value.args == (Collect(Path("drives")),)
     assert len(list(commands())) > 20
+
+
+def test_public_names_and_settings_are_told():
+    pytest.importorskip("mkdocs", reason="needs the extra `docs`")
+    spec = importlib.util.spec_from_file_location("reference", ROOT / "docs" / "reference.py")
+    reference = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(reference)
+    api = reference.api()
+    for name in ("VehicleState", "rollout", "NavigationEnv"):
+        assert f"\n### {name} " in api
+    assert "* `position`: `[..., 3]`" in api
+    assert "** in fit_chrono.yaml" in reference.configuration()
