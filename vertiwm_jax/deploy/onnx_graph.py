@@ -1,4 +1,4 @@
-"""NumPy code as an ONNX graph: it is run once on arrays that write down what is done to them."""
+"""Records NumPy code as an ONNX graph: runs it once on arrays that note each operation."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ import onnx
 from onnx import TensorProto, checker, helper, numpy_helper
 
 OPSET, IR_VERSION = 17, 8
-"""Old enough for the onnxruntime 1.13 of robots that are not updated every year."""
+"""Can be read by onnxruntime 1.13, which older robots have."""
 
 _END = np.iinfo(np.int64).max
 _OPERATORS = {
@@ -28,10 +28,10 @@ _OPERATORS = {
 
 
 def record(function: Callable[[Any], Any], inputs: int, outputs: int) -> bytes:
-    """A serialised model of `function`, `observation` `[B, inputs]` to `action` `[B, outputs]`.
+    """A serialized model of `function`: `observation` `[B, inputs]` to `action` `[B, outputs]`.
 
-    function: of a float32 array, in NumPy functions that `Recorded` knows; others raise
-        `TypeError`. B is dynamic.
+    function: takes a float32 array and uses only NumPy functions that `Recorded` knows; others
+        raise `TypeError`. B is dynamic.
     """
     graph = _Graph()
     result = graph.add("Identity", function(Recorded(graph, "observation")), output="action")
@@ -60,7 +60,7 @@ class _Graph:
     constants: list[onnx.TensorProto] = field(default_factory=list)
 
     def add(self, operator: str, *inputs: Any, output: str = "", **attributes: Any) -> "Recorded":
-        """The result of one more node; what is not recorded is a constant."""
+        """Adds a node and returns its result; inputs that are not `Recorded` become constants."""
         output = output or f"{operator.lower()}_{len(self.nodes)}"
         names = [self._name(x) for x in inputs]
         self.nodes.append(helper.make_node(operator, names, [output], **attributes))
@@ -78,7 +78,7 @@ class _Graph:
 
 @dataclass(frozen=True, eq=False)
 class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
-    """A float32 array to come, known by its name in the graph."""
+    """A float32 array whose values are not known yet; it has a name in the graph."""
 
     graph: _Graph
     name: str

@@ -19,7 +19,7 @@ Weights = dict[str, np.ndarray]
 class Policy:
     """An exported policy, called at every step of `about["step_seconds"]`.
 
-    about: what `policy.json` says. weights: what `policy.npz` holds, float32.
+    about: the content of `policy.json`. weights: the arrays of `policy.npz`, float32.
     """
 
     about: About
@@ -48,7 +48,7 @@ class Policy:
 
 
 def load(folder: str | Path) -> Policy:
-    """The policy in the folder that the export has made."""
+    """Loads the policy from an exported folder."""
     about = json.loads((Path(folder) / "policy.json").read_text(encoding="utf-8"))
     with np.load(Path(folder) / "policy.npz", allow_pickle=False) as file:
         return Policy(about, dict(file))
@@ -57,8 +57,8 @@ def load(folder: str | Path) -> Policy:
 def act(about: About, weights: Weights, observation: np.ndarray) -> np.ndarray:
     """`[B, O]` float32 observations to `[B, 2]` actions in [-1, 1].
 
-    What follows is written in functions of arrays and without their shapes, so that the export
-    can record it as an ONNX graph.
+    This function and those that it calls do not read shapes of arrays, so that the export can
+    record them as an ONNX graph.
     """
     correction = np.clip(_learned(about, weights, observation), -1, 1)
     if about["base"] is None:
@@ -68,7 +68,7 @@ def act(about: About, weights: Weights, observation: np.ndarray) -> np.ndarray:
 
 
 def _learned(about: About, weights: Weights, observation: np.ndarray) -> np.ndarray:
-    """The network: attention over arcs of constant steering, then dense layers."""
+    """The learned network: attention over arcs of constant steering, then dense layers."""
     limit = about["network"]["normalised_limit"]
     seen = np.clip((observation - weights["mean"]) / weights["std"], -limit, limit)
     steering = _float32(about["arcs"]["steering"])[:, None]
@@ -99,7 +99,7 @@ def _learned(about: About, weights: Weights, observation: np.ndarray) -> np.ndar
 
 
 def _compressed(about: About, weights: Weights, seen: np.ndarray) -> np.ndarray:
-    """The picture of the ground to `[B, 16]`: each of its tiles, then all of them together."""
+    """Compresses the terrain embedding to `[B, 16]`: first each tile, then all tiles together."""
     rows, columns, channels = about["network"]["embedding"]
     (kernel, bias), (together, last_bias) = _layers(weights, "Compressor_0")
     shape = (-1, rows * columns // 16, 16 * channels)
@@ -130,7 +130,7 @@ def _look_ahead(about: About, observation: np.ndarray) -> np.ndarray:
 
 
 def _straight_to_goal(about: About, observation: np.ndarray) -> np.ndarray:
-    """Steers at the goal, blind to the ground."""
+    """Steers straight to the goal and ignores the ground."""
     return _action(about, about["base"]["gain"] * _bearing(about, observation))
 
 
@@ -149,7 +149,7 @@ def _bearing(about: About, observation: np.ndarray) -> np.ndarray:
 
 
 def _arcs(about: About, observation: np.ndarray, name: str) -> np.ndarray:
-    """What the observation holds of the places ahead, `[B, arcs, stations]`."""
+    """The parts of the observation about places ahead, `[B, arcs, stations]`."""
     shape = (-1, len(about["arcs"]["steering"]), len(about["arcs"]["stations"]))
     return np.reshape(_part(about, observation, name)[:, 1:], shape)
 

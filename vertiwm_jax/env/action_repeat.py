@@ -1,4 +1,4 @@
-"""Action repeat: the same environment, decided upon less often."""
+"""Action repeat: an environment whose actions are held for several steps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ Controller = Callable[[jax.Array, Any], jax.Array]
 def corrected(
     base: Controller | None, observation: jax.Array, key: Any, correction: jax.Array
 ) -> jax.Array:
-    """What a controller does, `[..., A]`, with a correction; without one, the correction itself."""
+    """The action `[..., A]` of a controller plus a correction; without a base, the correction."""
     if base is None:
         return correction
     return jnp.clip(base(observation, key) + correction, -1.0, 1.0)
@@ -26,13 +26,12 @@ def corrected(
 class ActionRepeat(Environment):
     """Holds every action for `times` steps of `env`, or until the episode ends.
 
-    What `env` gives must stay as it is from the end of an episode on, with rewards of 0.
-    Rewards add up. Exploration noise that lasts moves a vehicle where noise that changes at every
-    step only shakes it, and credit is given to fewer decisions (Mnih et al., 2015).
+    Rewards are added up. After the end of an episode `env` must keep its state and give rewards
+    of 0. Exploration noise that lasts moves a vehicle, where noise that changes at every step only
+    shakes it, and there are fewer decisions to assign credit to (Mnih et al., 2015).
 
-    base: a controller that acts anew at every step, and that the held action, in [-1, 1],
-        corrects: learning starts from what it can do (Silver et al., 2018, "Residual policy
-        learning").
+    base: a controller that acts at every step. The held action, in [-1, 1], is added to its
+        action (Silver et al., 2018, "Residual policy learning").
     """
 
     env: Environment

@@ -1,4 +1,4 @@
-"""Policies that learn nothing: the rows beside every learned one."""
+"""Hand-made controllers, which tables show beside learned policies."""
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +12,11 @@ from vertiwm_jax.env.traversability import TraversabilityCost
 from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
 
 REFERENCE = "straight to goal"
-"""The baseline whose failures tell which tasks are hard."""
+"""The controller whose failures define which tasks are hard."""
 
 
 def baselines(config: NavigationConfig, vehicle: Vehicle) -> dict[str, Policy]:
-    """The policies of this file, by the names of their rows in a table."""
+    """The controllers, by their names in tables."""
     return {
         "look ahead": LookAhead(config),
         REFERENCE: StraightToGoal(config, float(vehicle.steering_limit)),
@@ -26,7 +26,7 @@ def baselines(config: NavigationConfig, vehicle: Vehicle) -> dict[str, Policy]:
 
 @struct.dataclass
 class StraightToGoal:
-    """Holds one speed and steers at the goal, blind to the ground.
+    """Holds one speed and steers straight to the goal; ignores the ground.
 
     config: of the environment, which says what actions mean; steering_limit: of the vehicle, rad.
     speed: m/s. gain: steering angle for each rad of bearing.
@@ -48,14 +48,13 @@ class StraightToGoal:
 
 @struct.dataclass
 class LookAhead:
-    """Holds one speed and steers along the arc that keeps level and leads on to the goal.
+    """Holds one speed and steers along arcs that stay level and lead to the goal.
 
-    The cost of an arc is how hard the ground on it is, near places first, and what the way to the
-    goal costs from its far places; the steering is the mean over arcs, weighed by
-    exp(-cost / spread).
+    The cost of an arc is the difficulty of its ground, near places first, plus the cost to go from
+    its far places. The steering is the mean over arcs with weights exp(-cost / spread).
 
     config: of the environment. speed: m/s. reach: wheelbases over which places lose weight.
-    onward: weight of each metre that is left to go. far: stations from which that is told.
+    onward: weight of each metre of cost to go. far: stations whose cost to go is used.
     """
 
     config: NavigationConfig = struct.field(pytree_node=False)
@@ -78,7 +77,7 @@ class LookAhead:
 
 @struct.dataclass
 class RandomActions:
-    """A new action at every step, uniform in [-1, 1]^2."""
+    """Draws a new action at every step, uniform in [-1, 1]^2."""
 
     def __call__(self, observation: jax.Array, key: jax.Array) -> jax.Array:
         """`[..., O]` observation to `[..., 2]` action."""

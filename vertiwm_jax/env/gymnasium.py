@@ -1,4 +1,4 @@
-"""Navigation for code that expects Gymnasium: one vehicle, or many at once."""
+"""The navigation task as Gymnasium environments: one vehicle, or many at once."""
 
 from functools import partial
 from typing import Any
@@ -83,7 +83,7 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """A start drawn from the pool; there are no options."""
+        """Draws a start from the pool. `options` is not used."""
         super().reset(seed=seed)
         self._key = jax.random.key(self.np_random.integers(2**31))
         observation, self._state = self._start()
@@ -138,7 +138,7 @@ class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """New starts for all vehicles, drawn from the pool; there are no options."""
+        """Draws new starts for all vehicles from the pool. `options` is not used."""
         super().reset(seed=seed)
         self._key = jax.random.key(self.np_random.integers(2**31))
         key = self._next_key()

@@ -1,7 +1,7 @@
-"""What a driving policy sees: motion, the goal in the vehicle's frame, and the ground near by.
+"""The observation of a driving policy: motion, goal in the body frame, and ground nearby.
 
-Nothing is in world coordinates, so a policy cannot learn a map by heart, and moving or turning
-the world with the vehicle leaves the observation as it is.
+Nothing is in world coordinates. So a policy cannot memorize a map, and an observation does not
+change when world and vehicle are moved or turned together.
 """
 
 from dataclasses import dataclass
@@ -34,17 +34,17 @@ _SINKAGE_SCALE = 0.1  # m
 _WALL = 1.5  # m, crown that stands for obstacles and the edge of the map
 
 GOAL = slice(8, 11)
-"""Where the observation holds the distance over 50 m and the cosine and sine of the bearing."""
+"""Place of the distance over 50 m and of the cosine and sine of the bearing."""
 GROUND = slice(13, 13 + 6 * _POSES)
-"""Where it holds height, crown, rise, bank, twist and route, of all places in turn."""
+"""Place of height, crown, rise, bank, twist and route, each of all places."""
 OBSERVATION_SIZE = GROUND.stop + 2 * CLASS_PLACES.size
 OBSERVATION_LIMIT = 10.0
-"""Every entry is clipped to this size."""
+"""Entries are clipped to this absolute value."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Where the observation holds something, in which unit, and what 1 stands for in it."""
+    """A part of the observation: its place, its unit, and the value that 1 stands for."""
 
     where: slice
     unit: str
@@ -73,11 +73,11 @@ LAYOUT = {
     "friction": Part(slice(GROUND.stop, OBSERVATION_SIZE, 2), "1", 1.0),
     "sinkage": Part(slice(GROUND.stop + 1, OBSERVATION_SIZE, 2), "m", _SINKAGE_SCALE),
 }
-"""What `observe` gives, by name; -1 in the last two means off the map."""
+"""The parts of the observation by name; -1 in the last two means off the map."""
 
 
 def distance_and_bearing(position: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`[..., 3]` points to the distance `[...]` and the horizontal unit vector `[..., 2]`."""
+    """Distance `[...]` and horizontal unit vector `[..., 2]` to points `[..., 3]`."""
     offset = goal - position
     # The maximum keeps the derivative finite at the goal itself.
     distance = jnp.sqrt(jnp.maximum(jnp.sum(offset**2, axis=-1), 1e-12))
@@ -86,9 +86,9 @@ def distance_and_bearing(position: jax.Array, goal: jax.Array) -> tuple[jax.Arra
 
 
 def plate_sinkage(terrain: TerrainMap) -> jax.Array:
-    """`[K]` m that a 0.25 m wide plate sinks under 50 kPa in each class, 0 on rigid ground.
+    """`[K]` sinkage, m, of a plate 0.25 m wide under 50 kPa in each class; 0 on rigid ground.
 
-    Bekker: p = (kc / b + kphi) z^n. One number that orders soils by how soft they are.
+    Bekker: p = (kc / b + kphi) z^n. This orders soils by softness.
     """
     soils = query.soils(terrain)
     stiffness = jnp.maximum(soils.kc / 0.25 + soils.kphi, 1.0)
@@ -104,7 +104,7 @@ def arcs_ahead(observation: jax.Array) -> tuple[jax.Array, ...]:
 
 
 def _split(observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What is seen on each arc `[..., 9, 49]`, its steering included, and all the rest."""
+    """The part of each arc `[..., 9, 49]`, including its steering, and the rest."""
     ahead = jnp.concatenate(arcs_ahead(observation), axis=-1)
     steering = jnp.broadcast_to(ARC_STEERING.astype(np.float32), ahead.shape[:-1])
     here = observation[..., GROUND][..., ::_POSES]
@@ -113,7 +113,7 @@ def _split(observation: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 ARCS = Candidates(_split, tuple((0.0, float(steering)) for steering in ARC_STEERING))
-"""The arcs as candidates of a policy: each stands for its steering."""
+"""The arcs as candidates of a policy; each stands for its steering."""
 
 
 def poses_ahead(vehicle: Vehicle) -> tuple[jax.Array, jax.Array]:
@@ -193,9 +193,9 @@ def observe(
 
 
 def with_embedding(observation: jax.Array, embedding: jax.Array) -> jax.Array:
-    """The observation of a policy that also sees the ground as encoders do, `EMBEDDING_SHAPE`.
+    """The observation followed by a terrain embedding of `EMBEDDING_SHAPE`.
 
-    Tile by tile, so that networks, which read it many times, need not put it in that order.
+    The embedding is stored tile by tile, the order in which networks read it.
     """
     # What a model sees where it has diverged may be anything.
     clipped = jnp.clip(jnp.nan_to_num(embedding), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)

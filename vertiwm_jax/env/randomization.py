@@ -1,7 +1,7 @@
-"""What an episode keeps to itself: ground and commands that are not quite what the map says.
+"""Domain randomization: episodes with other ground and later commands than the policy expects.
 
-A policy that has met weaker soil, less grip and late commands while it learned relies less on what
-is peculiar to its model (Peng et al., 2018, "Sim-to-real transfer with dynamics randomization").
+A policy that has trained with weaker soil, less grip and late commands relies less on
+errors of its model (Peng et al., 2018, "Sim-to-real transfer with dynamics randomization").
 """
 
 import dataclasses
@@ -20,14 +20,14 @@ _STRENGTH = "kc", "kphi", "cohesion"
 
 @settings
 class RandomizationConfig:
-    """Least and most of what each episode draws evenly; nothing varies by default."""
+    """Bounds of what each episode draws uniformly; nothing varies by default."""
 
     grip: tuple[float, float] = (1.0, 1.0)
-    """Factor of the friction of rigid ground."""
+    """Factor on the friction of rigid ground."""
     soil: tuple[float, float] = (1.0, 1.0)
-    """Factor of how stiff and how cohesive all soils are."""
+    """Factor on stiffness and cohesion of all soils."""
     delay: tuple[int, int] = (0, 0)
-    """Steps of 0.1 s that commands come late."""
+    """Delay of commands, in steps of 0.1 s."""
 
     def check(self):
         for name, least in (("grip", 0.01), ("soil", 0.01), ("delay", 0)):
@@ -40,7 +40,7 @@ class RandomizationConfig:
 
 @struct.dataclass
 class DomainRandomization:
-    """What one episode has drawn; None stands for what does not vary.
+    """The draw of one episode; None for what does not vary.
 
     grip, soil: `[]` factors. delay: `[]` int32 steps. sent: `[D, 2]` the last actions, the latest
     first; D is the longest delay.
@@ -53,7 +53,7 @@ class DomainRandomization:
 
     @classmethod
     def draw(cls, config: RandomizationConfig, key: jax.Array, action: jax.Array) -> Self:
-        """That of an episode before which `[2]` action was sent."""
+        """Draws for an episode; `[2]` action is the one sent before it."""
         grip, soil, delay = jax.random.split(key, 3)
 
         def factor(key: jax.Array, span: tuple[float, float]) -> jax.Array | None:
@@ -69,7 +69,7 @@ class DomainRandomization:
         return dataclasses.replace(drawn, delay=steps, sent=sent)
 
     def ground(self, terrain: TerrainMap) -> TerrainMap:
-        """The ground that the vehicle meets where the map says `terrain`."""
+        """The ground that moves the vehicle, where the policy sees `terrain`."""
         if self.grip is not None:
             terrain = dataclasses.replace(terrain, grip=self.grip)
         if self.soil is not None:
@@ -79,7 +79,7 @@ class DomainRandomization:
         return terrain
 
     def arriving(self, action: jax.Array) -> tuple[jax.Array, Self]:
-        """The action `[2]` that the vehicle follows when `action` is sent, and what comes next."""
+        """The action `[2]` that reaches the vehicle when `action` is sent, and the new state."""
         if self.delay is None or self.sent is None:
             return action, self
         sent = jnp.concatenate([action[None], self.sent])

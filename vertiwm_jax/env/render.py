@@ -1,4 +1,4 @@
-"""Worlds seen from above: a hill-shaded, tinted raster, and one with a vehicle on it."""
+"""Pictures of worlds from above, hill-shaded and tinted, without and with a vehicle."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ def extent(terrain: TerrainMap) -> tuple[float, float, float, float]:
 
 
 def shaded(terrain: TerrainMap, world: int, enlarge: int = _PIXELS_A_VERTEX) -> np.ndarray:
-    """`[H, W, 3]` in [0, 1], north up: class colours, paled, under light from the north-west.
+    """`[H, W, 3]` in [0, 1], north up: pale class colors, with light from the north-west.
 
     H, W are `enlarge` pixels for each cell between vertices; heights are interpolated.
     """

@@ -1,4 +1,4 @@
-"""The reward of goal navigation: progress, less discomfort and standing still, and the ending."""
+"""The reward of goal navigation: progress, minus discomfort and stalling, plus the ending."""
 
 import dataclasses
 import math
@@ -11,17 +11,17 @@ from vertiwm_jax.env.termination import TerminationReason
 
 @dataclasses.dataclass(frozen=True)
 class RewardConfig:
-    """Weights in Verti-Bench's shape; all are gains, penalties are subtracted.
+    """Weights of the reward, in Verti-Bench's shape; penalties are subtracted.
 
-    progress: for each metre by which what the way to the goal costs falls.
-    stalled: for each step spent standing.
+    progress: for each metre by which the cost to go falls.
+    stalled: for each stalled step.
     tilt: for roll and for pitch beyond `tilt_limit`.
-    tilt_limit: rad.
+    tilt_limit: roll and pitch that cost nothing, rad.
     vertical: for each m/s of vertical speed, each step.
-    goal, stuck, failure: once, at the ending; failure is any other terminal ending.
-    timed_out, timed_out_distance: once, and for each metre that is left then.
-    disagreement: for each metre that the parts of a model disagree, each step.
-    spread: for each metre by which its gates spread where it goes, each step.
+    goal, stuck, failure: once, at the end; failure is any other terminal ending.
+    timed_out, timed_out_distance: once at the time limit, and for each metre left then.
+    disagreement: for each metre by which the specialists of a model disagree, each step.
+    spread: for each metre of spread of its gates, each step.
     """
 
     progress: float = 50.0

@@ -1,8 +1,9 @@
-"""Ways to goals over ground that is known: what it costs to go on to a goal from anywhere.
+"""Routes over known ground: the cost of driving on to a goal from anywhere.
 
-Ways lead through the middles of cells that tile the map, by moves to sixteen cells around. A move
-costs its length, and more where the ground would tilt, twist or ground the vehicle, or where an
-obstacle stands. Costs to go are those of the cheapest way (Bellman's equation, by value iteration).
+A route goes through the middles of cells that tile the map, by moves to sixteen cells around. A
+move costs its length, and more where the ground would tilt, twist or ground the vehicle, or where
+an obstacle stands. The cost to go is that of the cheapest route (Bellman's equation, solved by
+value iteration).
 """
 
 import functools
@@ -23,7 +24,7 @@ from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
 
 CLEARANCE = 0.3
-"""Metres that are kept from obstacles."""
+"""Clearance to obstacles, m."""
 _MOVES = np.array([(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)])
 _PLACES = np.array([0.0, 0.5, 1.0])  # of a move, where the ground is looked at
 _TOGETHER = 1  # goal, or world, that a device works at: what it reads stays in its cache
@@ -34,12 +35,12 @@ _NEAR = 1.5  # cells from a goal within which the way to it is straight
 
 @settings
 class RouteConfig:
-    """How ways to goals are weighed where the map is known; static.
+    """Costs of routes on a known map; static.
 
-    cells: along each side of the map.
-    difficulty: what ground is hard to drive.
-    detour: m of level ground that a metre of difficulty 1 costs beyond its length.
-    blocked: the same of a metre in which an obstacle, or the edge of the map, is touched.
+    cells: number along each side of the map.
+    difficulty: how hard ground is to drive on.
+    detour: extra cost of a metre of difficulty 1, in metres of level ground.
+    blocked: extra cost of a metre that touches an obstacle or the edge of the map.
     """
 
     cells: Annotated[int, Bounds(4)] = 64
@@ -50,7 +51,7 @@ class RouteConfig:
 
 @struct.dataclass
 class Routes:
-    """Costs to go to P goals, one of which is selected.
+    """Costs to go to P goals, of which one is selected.
 
     cost: `[P, n, n]` m of level ground, from the middles of cells; row 0 is the northernmost.
     number: `[]` int32, of the selected goal.
@@ -64,7 +65,7 @@ class Routes:
         return replace(self, number=jnp.asarray(number, jnp.int32))
 
     def cost_to_go(self, terrain: TerrainMap, xy: jax.Array) -> jax.Array:
-        """`[..., 2]` points to `[...]` m, bilinear; off the map that of the nearest place on it."""
+        """Cost to go `[...]`, m, from points `[..., 2]`; bilinear, off the map that of its edge."""
         cells = self.cost.shape[-1]
         place = (xy - terrain.origin) * jnp.array([1.0, -1.0]) / _cell_size(terrain, cells) - 0.5
         # `where` and not `clip`: NaN becomes 0, and its gradient too.
@@ -85,7 +86,7 @@ class Routes:
 def plan(
     config: RouteConfig, terrain: TerrainMap, vehicle: Vehicle, world: jax.Array, goal: jax.Array
 ) -> Routes:
-    """Routes to goals `[P, 2]`, m, in worlds `[P]`; all devices work at them."""
+    """Routes to goals `[P, 2]`, m, in worlds `[P]`, computed by all devices."""
     of_worlds = parallel.shared_out(functools.partial(_all_costs, config), terrain.worlds)
     costs = of_worlds(vehicle, terrain, jnp.arange(terrain.worlds))
     to_goals = parallel.shared_out(_all_costs_to_go, len(world))
@@ -100,7 +101,7 @@ def plan_one(config: RouteConfig, terrain: TerrainMap, vehicle: Vehicle, goal: j
 
 
 def straight(config: RouteConfig, terrain: TerrainMap, goal: jax.Array) -> Routes:
-    """The routes to goals `[P, 2]`, m, of whoever knows nothing of the ground: distances."""
+    """Routes to goals `[P, 2]`, m, on unknown ground: straight distances."""
     offset = goal[:, None, None] - _middles(terrain, config.cells)
     return Routes(jnp.linalg.norm(offset, axis=-1), jnp.int32(0))
 
@@ -126,7 +127,7 @@ def _all_costs_to_go(
 def _costs(
     config: RouteConfig, vehicle: Vehicle, terrain: TerrainMap, world: jax.Array
 ) -> jax.Array:
-    """`[16, n, n]` m of level ground that moves from cells cost, those of `_MOVES` and back."""
+    """`[16, n, n]` costs of moves from cells, those of `_MOVES` and back, m of level ground."""
     terrain = terrain.select(world)
     move = _MOVES * _cell_size(terrain, config.cells)
     length, heading = jnp.linalg.norm(move, axis=-1), jnp.arctan2(move[:, 1], move[:, 0])
@@ -173,12 +174,12 @@ def _costs_to_go(
 
 
 def _padded(values: jax.Array) -> jax.Array:
-    """Values `[n, n]` with inf around them, as far as moves reach."""
+    """Values `[n, n]` with a border of inf as wide as moves reach."""
     return jnp.pad(values, _REACH, constant_values=jnp.inf)
 
 
 def _window(padded: jax.Array, move: np.ndarray) -> jax.Array:
-    """What padded values are where a move leads to, `[n, n]`."""
+    """The padded values at the cells that a move leads to, `[n, n]`."""
     east, north = (int(x) for x in move)
     rows, columns = (size - 2 * _REACH for size in padded.shape)
     return padded[_REACH - north :, _REACH + east :][:rows, :columns]

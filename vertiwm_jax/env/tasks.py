@@ -1,4 +1,4 @@
-"""Navigation tasks: where a vehicle starts, which way it looks, and where it must go."""
+"""Navigation tasks: start, heading and goal."""
 
 import dataclasses
 import functools
@@ -25,7 +25,7 @@ _DRAWN_TOGETHER = 16  # random tasks
 
 
 class TaskError(UserError, ValueError):
-    """Tasks that cannot be driven, or found, on the map; the message says why."""
+    """No task can be found on the map, or a given one cannot be driven; the message says why."""
 
 
 @struct.dataclass
@@ -46,14 +46,14 @@ class Tasks:
 
 @dataclasses.dataclass(frozen=True)
 class RandomTaskConfig:
-    """Which random tasks are accepted.
+    """Conditions on random tasks.
 
-    distance: m, least and most from start to goal.
-    heading_error: rad, the start looks at most this far off the goal.
-    steepest_start: rad, of the ground under the wheels; roughest_start: rad, root mean square
-        slope within 4 m.
-    clearance: m that start and goal keep from obstacles and `margin` m from the map's edge.
-    candidates: drawn for each task; the first acceptable one is taken.
+    distance: least and largest distance from start to goal, m.
+    heading_error: rad, largest angle between the heading at the start and the goal.
+    steepest_start: largest slope of the ground under the wheels, rad.
+    roughest_start: largest root mean square slope within 4 m, rad.
+    clearance, margin: m that start and goal keep from obstacles and from the map's edge.
+    candidates: number drawn for each task; the first acceptable one is taken.
     """
 
     distance: tuple[float, float] = (20.0, 115.0)
@@ -70,10 +70,10 @@ def circle_tasks(
 ) -> Tasks:
     """Verti-Bench's geometry: W x `pairs` tasks across a circle, world after world.
 
-    Starts are evenly spaced on a circle about the middle of the map, each goal lies opposite,
-    and the vehicle looks at it. With `sway`, each pair turns up to that many rad about the circle
-    to where the ground at the start is most level: on rough ground a vehicle often cannot leave
-    a start that was not looked at. `ValueError` if the circle does not fit on the map.
+    Starts are evenly spaced on a circle about the middle of the map. Each goal lies opposite its
+    start, and the vehicle heads for it. With `sway`, each pair turns by up to that many rad about
+    the circle to the most level start: on rough ground a vehicle often cannot leave a start at a
+    fixed place. `ValueError` if the circle does not fit on the map.
     """
     rows, columns = terrain.elevation.shape[-2:]
     half = np.array([columns - 1, rows - 1]) * float(terrain.resolution) / 2
@@ -129,7 +129,7 @@ def random_tasks(
 ) -> Tasks:
     """`count` random tasks, spread evenly over the worlds.
 
-    `ValueError` if for some task no candidate was acceptable.
+    `ValueError` if no candidate was acceptable for some task.
     """
     tasks, found = _draw(key, terrain, count, vehicle, config)
     missing = int(count - found.sum())

@@ -9,7 +9,7 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 
 class TerminationReason(enum.IntEnum):
-    """Why an episode is over; a time-out truncates, all after it terminate."""
+    """Why an episode is over: `TIMED_OUT` truncates it, all later ones terminate it."""
 
     RUNNING = 0
     TIMED_OUT = 1
@@ -22,9 +22,10 @@ class TerminationReason(enum.IntEnum):
 
 
 def first_ending(conditions: dict[TerminationReason, jax.Array]) -> jax.Array:
-    """`[...]` int32 code of the gravest condition that holds, `RUNNING` if none does.
+    """`[...]` int32 code of the most severe condition that holds; `RUNNING` if none does.
 
-    Gravest is the largest code: a vehicle that reaches the goal upside down has rolled over.
+    The largest code is the most severe: a vehicle that reaches the goal on its roof has rolled
+    over.
     """
     order = sorted(conditions, reverse=True)
     return jnp.select(
@@ -35,7 +36,7 @@ def first_ending(conditions: dict[TerminationReason, jax.Array]) -> jax.Array:
 
 
 def is_terminal(ending: jax.Array) -> jax.Array:
-    """`[...]` whether the code ends the task itself and not only its time."""
+    """`[...]` whether the code terminates an episode; running out of time does not."""
     return ending > TerminationReason.TIMED_OUT
 
 

@@ -1,4 +1,4 @@
-"""What ground does to a vehicle that stands on it, and how hard that makes it to drive."""
+"""How ground tilts and touches a vehicle on it, and how hard it is to drive on."""
 
 from dataclasses import dataclass
 
@@ -16,12 +16,12 @@ CROWN_SCALE = 0.2  # m
 
 @struct.dataclass
 class Footprint:
-    """The ground under vehicles, leaves `[...]`.
+    """The ground below a vehicle, leaves `[...]`.
 
     mean: height under the wheels, m.
-    crown: of the ground midway between them above that, which the belly meets, over 0.2 m.
+    crown: height of the ground between the wheels above that, which the belly touches, over 0.2 m.
     rise, bank: slopes from rear to front and from right to left, over 0.4.
-    twist: by how much the slopes of both axles differ, which lifts wheels, over 0.2.
+    twist: difference of the slopes at both axles, which lifts wheels, over 0.2.
     """
 
     mean: jax.Array
@@ -57,10 +57,10 @@ def footprint(vehicle: Vehicle, heights: jax.Array) -> Footprint:
 
 @dataclass(frozen=True)
 class TraversabilityCost:
-    """What makes ground hard to drive.
+    """The difficulty of ground.
 
-    bank, rise, twist, crown: weights of the squares of what a `Footprint` has.
-    tolerated: bank and rise up to here cost nothing.
+    bank, rise, twist, crown: weights of the squares of the parts of a `Footprint`.
+    tolerated: bank and rise that cost nothing.
     """
 
     bank: float = 1.0

@@ -1,1 +1,1 @@
-"""Logged drives of other origin as recorded drives of this project: one file a kind of log."""
+"""Makes recorded drives of logs in other formats; one file for each format."""

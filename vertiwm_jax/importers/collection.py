@@ -1,4 +1,4 @@
-"""Imported drives as a collection: files of the schema, a map, and what a split needs."""
+"""Writes imported drives as a collection: files in the schema, and their map."""
 
 import io
 import json
@@ -18,11 +18,11 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 MAP = "map.npz"
 PER_FILE = SPLITS["test"].stop
-"""Drives in a file, of which the first are trained on and the last are tested on."""
+"""Drives in a file. The first of them are for training, the last for tests."""
 
 
 def arrays(drives: Sequence[Drive]) -> dict[str, np.ndarray]:
-    """K drives as arrays of the schema, each filled up to the longest with its last values."""
+    """K drives as arrays of the schema; shorter drives are padded with their last values."""
     steps = max(len(drive.control) for drive in drives)
 
     def filled(array: np.ndarray, length: int) -> np.ndarray:
@@ -64,7 +64,7 @@ def on_map(terrain: TerrainMap, drive: Drive) -> bool:
 
 
 def clearance(terrain: TerrainMap, drives: Sequence[Drive]) -> np.ndarray:
-    """`[3]` m that the body origin is above the ground: a quarter, half, three quarters less."""
+    """`[3]` quartiles of the height of the body origin above the ground, m."""
     position = np.concatenate([drive.state[:, :3] for drive in drives])
     ground = query.surface(terrain, jnp.asarray(position[:, :2], jnp.float32)).height
     return np.quantile(position[:, 2] - np.asarray(ground), [0.25, 0.5, 0.75])

@@ -1,4 +1,4 @@
-"""The ground of a collection from the GridMap messages of its bags."""
+"""Builds the map of a collection from the GridMap messages of its bags."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ _KIND = "grid_map_msgs/msg/GridMap"
 
 
 class Canvas:
-    """Layers on one raster that grows with what is painted; the newest value of a cell stays.
+    """A raster of layers that grows as patches are painted; the newest value of a cell counts.
 
     Cell (i, j) lies at x = resolution (corner[0] + i), y = resolution (corner[1] + j), m, plus
     what the first patch was off from whole cells.
@@ -56,10 +56,10 @@ class Canvas:
 def terrain(
     paths: Sequence[Path], wanted: GridMapSettings, frames: Frames
 ) -> tuple[TerrainMap, float]:
-    """The ground that all messages of the bags tell of, and the share of it that none does.
+    """The map from all messages of the bags, and the share of its cells that no message covers.
 
-    Heights of such cells are those of the nearest cell. Raises `DataError` naming bag, topic and
-    expectation, and `MapError` if the heights make no map.
+    Cells that no message covers take the height of the nearest cell. Raises `DataError` naming bag,
+    topic and expectation, and `MapError` if the heights make no map.
     """
     names = [wanted.elevation] + ([wanted.semantic] if wanted.semantic else [])
     canvas = None

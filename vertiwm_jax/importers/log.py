@@ -1,4 +1,4 @@
-"""A drive as it was logged: checked, in SI units, at full size and in the axes of this project."""
+"""A logged drive, checked and converted to SI units, full size and the axes of this project."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from vertiwm_jax.learning.schema import DataError
 
 @dataclass(frozen=True)
 class Log:
-    """N poses of the logged point and M commands, each with stamps of their own.
+    """N poses of the logged point and M commands, each with its own time stamps.
 
     time: `[N]` s, increasing; position: `[N, 3]` p_world, m; rotation: N of body to world;
     velocity: `[N, 3]` v_body, m/s, angular_velocity: `[N, 3]` omega_body, rad/s, None where they
@@ -39,7 +39,7 @@ def build(
     velocity: np.ndarray | None = None,
     angular_velocity: np.ndarray | None = None,
 ) -> Log:
-    """The log with these arrays, which are in its own units and frames.
+    """Makes a log from arrays in the units and frames of the log file.
 
     time: `[N]`; position: `[N, 3]`; attitude: `[N, 3]` roll, pitch, yaw or `[N, 4]` quaternions
     x, y, z, w; velocity, angular_velocity: `[N, 3]`; command_time: `[M]`; command: `[M, 2]` speed

@@ -1,4 +1,4 @@
-"""Drives of a simulator as a vehicle would have logged them: sampled, late, noisy, with gaps."""
+"""Turns simulated drives into logs as a real vehicle would write them: noisy, late, with gaps."""
 
 from typing import Annotated
 
@@ -18,7 +18,7 @@ _TOLERANCE = 1e-9
 
 @settings
 class NoiseConfig:
-    """What a vehicle's localisation does to its poses; SI units, at the vehicle's own size."""
+    """Errors of a vehicle's localization, in SI units at the vehicle's own size."""
 
     rate: Positive = 50.0
     """Poses a second."""
@@ -27,7 +27,7 @@ class NoiseConfig:
     attitude: NotNegative = 0.005
     """rad, standard deviation about each axis."""
     latency: NotNegative = 0.02
-    """s by which the stamp of a pose is late; commands have stamps of their own."""
+    """s by which the stamp of a pose is late. Stamps of commands are exact."""
     dropped: Annotated[float, Bounds(0, 1, below=True)] = 0.05
     """Share of samples that are lost."""
 

@@ -1,4 +1,4 @@
-"""Logs at irregular moments to drives at 10 Hz."""
+"""Resamples logs with irregular time stamps to drives at 10 Hz."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -28,7 +28,7 @@ class Drive:
 
 @dataclass
 class Resampled:
-    """The drives of a log, and how many more there were, by why they were left out."""
+    """The drives of a log, and the number of those left out, by the reason."""
 
     drives: list[Drive] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
@@ -37,9 +37,9 @@ class Resampled:
 def resample(log: Log, settings: Resampling, logged_point: np.ndarray) -> Resampled:
     """The drives between the gaps of a log.
 
-    logged_point: `[3]` m, of which the log has the positions, in the body. Positions and logged
-    velocities are interpolated linearly, attitudes along the shortest rotation; a command holds
-    until the next. Velocities that were not logged are slopes of parabolas that are fitted to
+    logged_point: `[3]` m in the body frame, the point whose position was logged. Positions and
+    logged velocities are interpolated linearly, attitudes along the shortest rotation; a command
+    holds until the next. Velocities that were not logged are slopes of parabolas that are fitted to
     the poses within `settings.window`.
     """
     found = Resampled()
@@ -63,8 +63,8 @@ def resample(log: Log, settings: Resampling, logged_point: np.ndarray) -> Resamp
 def directions(drives: Sequence[Drive]) -> tuple[float, float]:
     """Median angles, rad, over the steps at 1 m/s or more; NaN if there are none.
 
-    That between the velocity and the way that the step goes, and that between the velocity and
-    the axis along which the vehicle drives.
+    The first is between the velocity and the displacement of the step, the second between the
+    velocity and the body's x axis.
     """
     state = np.concatenate([drive.state[:-1] for drive in drives])
     moved = np.concatenate([np.diff(drive.state[:, :3], axis=0) for drive in drives])

@@ -1,4 +1,4 @@
-"""ROS 1 and ROS 2 bags: odometry and commands."""
+"""Reads odometry and commands from ROS 1 and ROS 2 bags."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -44,7 +44,7 @@ DEFINITIONS = {
 
 
 def read(path: Path, settings: ImportSettings) -> list[Log]:
-    """The one log of a bag: a `.bag` file of ROS 1, or a folder of ROS 2.
+    """Reads the log of a bag: a `.bag` file of ROS 1, or a folder of ROS 2.
 
     Raises `DataError` naming bag, topic and expectation.
     """
@@ -82,7 +82,7 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
 def steering(speed: np.ndarray, yaw_rate: np.ndarray, wheelbase: float) -> np.ndarray:
     """`[M]` m/s and rad/s to the `[M]` front-wheel angles, rad, that turn so without slip.
 
-    A command to stand tells no angle: the wheels stay as they were, straight at the beginning.
+    At zero speed a yaw rate gives no angle: the wheels keep theirs, and are straight at first.
     """
     moving = speed != 0
     angle = np.arctan(wheelbase * yaw_rate / np.where(moving, speed, 1))
@@ -91,7 +91,7 @@ def steering(speed: np.ndarray, yaw_rate: np.ndarray, wheelbase: float) -> np.nd
 
 
 def messages(path: Path, topic: str, kinds: Sequence[str]) -> Iterator[tuple[int, Any]]:
-    """When each message of a topic was received, ns, and the message, of one of the types.
+    """The messages of a topic, each with the time at which it was received, ns.
 
     Raises `DataError` where the bag cannot be read, or has no such messages.
     """

@@ -1,4 +1,4 @@
-"""What an importer must be told of a log: the vehicle, units, frames, and where its data lie."""
+"""Settings that describe a log: the vehicle, units, frames, and the names of its data."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -12,7 +12,7 @@ Names = tuple[str, str, str]
 
 @settings
 class VehicleSettings:
-    """The wheels, and what the log calls the pose of the vehicle."""
+    """Geometry of the vehicle, and the point whose pose was logged."""
 
     wheelbase: Positive
     """m between the axles."""
@@ -22,8 +22,8 @@ class VehicleSettings:
     """The point whose position is logged, in the body frame of this project (x forward, y left,
     z up, from the point between the four wheel centres), m."""
     scale: Positive = 1.0
-    """m at full size that 1 m of the vehicle is, as in its file; drives and map become as large,
-    and times and speeds its root times as large, before `resampling`."""
+    """The factor from the vehicle to full size, as in its file: 10 for a 1/10-scale rover. Drives
+    and map are enlarged by it, times and speeds by its square root, before `resampling`."""
 
     @property
     def wheels_in_body_xy(self) -> list[list[float]]:
@@ -45,7 +45,7 @@ class Units:
     velocity: float = 1.0
     """m/s, of logged velocities."""
     speed: float = 1.0
-    """m/s, of commanded speeds; where a throttle is logged, the speed that 1 stands for."""
+    """m/s, of commanded speeds. Where a throttle was logged: the speed at a throttle of 1."""
     steering: float = 1.0
     """rad of the front wheels, rad/s of commanded yaw rates; negative where right is positive."""
 
@@ -57,17 +57,17 @@ class Units:
 
 @dataclass(frozen=True)
 class Frames:
-    """Which frames the log is in."""
+    """Frames of the log."""
 
     axes: Literal["z_up", "z_down"] = "z_up"
     """x forward, y left, z up in a world whose z is up; or forward-right-down in one whose z is
     down (north-east-down)."""
     velocity: Literal["body", "world"] = "body"
-    """Frame of logged velocities; ROS's odometry has them in the body."""
+    """Frame of logged velocities; ROS odometry uses the body frame."""
     angular_velocity: Literal["body", "world"] = "body"
     """Frame of logged angular velocities."""
     origin: Triple = (0.0, 0.0, 0.0)
-    """What becomes the origin of the world, in the world of the log once z is up, m."""
+    """Point of the log's world that becomes the origin, m, after z has been turned up."""
 
 
 @settings
@@ -75,9 +75,9 @@ class Resampling:
     """How a log becomes drives at 10 Hz."""
 
     gap: Positive = 0.5
-    """s without a pose that end a drive; the next one begins after them."""
+    """A drive ends where poses are missing for longer than this, s; the next begins after that."""
     command_gap: Positive = 0.5
-    """The same for commands; the last one is held as long."""
+    """The same for commands. A command is held for up to this time."""
     window: Positive = 0.5
     """s over which a parabola is fitted to poses, where velocities are not logged."""
     shortest: int = 32
@@ -96,10 +96,10 @@ class Resampling:
 
 @settings
 class Table:
-    """Names of the columns of a CSV or Parquet file, a row a moment."""
+    """Names of the columns of a CSV or Parquet file with one row per time stamp."""
 
     time: str
-    """When the row was logged."""
+    """Time stamp of the row."""
     position: Names
     """x, y, z."""
     speed: str
@@ -107,17 +107,17 @@ class Table:
     steering: str
     """Commanded angle of the front wheels."""
     rpy: Names | None = None
-    """Roll, pitch and yaw, R = Rz Ry Rx; or else"""
+    """Roll, pitch and yaw, R = Rz Ry Rx. Give this or `quaternion`."""
     quaternion: tuple[str, str, str, str] | None = None
-    """x, y, z, w."""
+    """x, y, z, w. Give this or `rpy`."""
     velocity: Names | None = None
-    """From the positions by default."""
+    """Estimated from the positions by default."""
     angular_velocity: Names | None = None
-    """From the attitudes by default."""
+    """Estimated from the attitudes by default."""
     brake: str | None = None
-    """What is subtracted from `speed`, where that is a throttle."""
+    """Column that is subtracted from `speed`, where that is a throttle."""
     drive: str | None = None
-    """Tells drives apart; by default a file is one drive."""
+    """Column whose value differs between drives; by default a file is one drive."""
 
     def check(self):
         if (self.rpy is None) == (self.quaternion is None):
@@ -126,7 +126,7 @@ class Table:
 
 @settings
 class GridMapSettings:
-    """Ground from all messages of a grid_map_msgs/GridMap topic; the newest height counts."""
+    """How the map is built from a grid_map_msgs/GridMap topic; the newest height counts."""
 
     topic: str
     """Name of the topic."""
@@ -135,7 +135,7 @@ class GridMapSettings:
     semantic: str | None = None
     """Layer of class ids; by default all ground is of one class."""
     ground: str = "grass"
-    """That class, also where the layer has none."""
+    """Ground class where there is no such layer, or where it has no value."""
 
     def check(self):
         if self.ground not in STANDARD.names:
@@ -152,11 +152,11 @@ class Topics:
     command: str
     """ackermann_msgs/AckermannDrive or geometry_msgs/Twist, either with or without a stamp."""
     twist: Literal["yaw_rate", "steering"] = "yaw_rate"
-    """What angular.z of a Twist is; linear.x is the speed."""
+    """Meaning of angular.z of a Twist; linear.x is the speed."""
     stamps: Literal["header", "bag"] = "header"
-    """When a message counts: by its header, if it has one, or when it was received."""
+    """Time of a message: its header's, where it has one, or the time at which it was received."""
     grid_map: GridMapSettings | None = None
-    """Ground, unless a map is given."""
+    """Builds the map from the bag, unless a map is given."""
 
 
 @dataclass(frozen=True)
@@ -164,22 +164,23 @@ class Trajectories:
     """Names in a trajectory of TartanDrive."""
 
     state: str = "state"
-    """The observation, or the folder, that holds p, q (x, y, z, w) and perhaps velocities."""
+    """Name of the observation or folder with position, quaternion (x, y, z, w) and, if any,
+    velocities."""
     command: str = "cmd"
-    """The folder that holds throttle and steering."""
+    """Name of the folder with throttle and steering."""
 
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """All that `import_drives` reads from its settings file."""
+    """The settings file of `import_drives`."""
 
     vehicle: VehicleSettings
     units: Units = Units()
     frames: Frames = Frames()
     resampling: Resampling = Resampling()
     table: Table | None = None
-    """Of CSV and Parquet."""
+    """Columns of CSV and Parquet files."""
     rosbag: Topics | None = None
-    """Of ROS bags."""
+    """Topics of ROS bags."""
     tartandrive: Trajectories = Trajectories()
-    """Of TartanDrive."""
+    """Names in TartanDrive's files."""

@@ -1,4 +1,4 @@
-"""CSV and Parquet: a row a moment, columns as the settings name them."""
+"""Reads CSV and Parquet files: one row per time stamp, with columns named by the settings."""
 
 import csv
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ Columns = dict[str, np.ndarray]
 
 
 def read_csv(path: Path, settings: ImportSettings) -> list[Log]:
-    """The drives of a CSV file with a head, in the order in which they begin.
+    """The drives of a CSV file with a header line, in the order in which they begin.
 
     Raises `DataError` naming file, column and expectation.
     """
@@ -50,7 +50,7 @@ def _read(
 
 
 def _names(table: Table) -> list[str]:
-    """All columns that are read."""
+    """The names of all columns that are read."""
     groups = (table.position, table.rpy, table.quaternion, table.velocity, table.angular_velocity)
     single = (table.time, table.speed, table.steering, table.brake, table.drive)
     names = [name for group in groups for name in group or ()] + [name for name in single if name]

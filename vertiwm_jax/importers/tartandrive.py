@@ -1,4 +1,4 @@
-"""TartanDrive: trajectories of version 1, folders of version 2. (Its bags are bags of ROS 1.)
+"""Reads TartanDrive: trajectories of version 1 and folders of version 2. Bags are ROS 1 bags.
 
 A trajectory of version 1 is what its authors' `multi_convert_bag.py` writes by `torch.save`: a
 dictionary of `observation`, a dictionary with the state `[T, 7]` or `[T, 13]`; `action`, `[T, 2]`;
@@ -22,11 +22,11 @@ from vertiwm_jax.learning.schema import DataError
 
 _STATE = (7, 13)
 _UNREADABLE = (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError)
-"""What torch and pickle raise at a file that is no trajectory."""
+"""Errors of torch and pickle for a file that is no trajectory."""
 
 
 def read(path: Path, settings: ImportSettings) -> list[Log]:
-    """The one log of a `.pt` trajectory or of a folder; `DataError` names what is wrong."""
+    """Reads the log of a `.pt` trajectory or of a folder; raises `DataError`."""
     load = _folder if path.is_dir() else _trajectory
     time, state, command_time, command = load(path, settings)
     moving = state.shape[1] == _STATE[1]

@@ -1,4 +1,4 @@
-"""What is believed of a map of which only a part is known."""
+"""What a vehicle knows and assumes of a map that is known in part."""
 
 import jax
 from flax import struct
@@ -6,9 +6,9 @@ from flax import struct
 
 @struct.dataclass
 class MapBelief:
-    """What one vehicle knows of the selected world, and what it takes the rest to be.
+    """The cells of the selected world that a vehicle knows, and its assumption about the rest.
 
-    known: `[n, n]` bool, of cells that tile the map, row 0 the northernmost.
+    known: `[n, n]` bool, for cells that tile the map; row 0 is the northernmost.
     plane: `[3]` of unknown ground: its height at x = y = 0, m, and its slopes along x and y.
     semantic: `[]` int32 class id; friction: `[]` friction coefficient, both of unknown ground.
     """

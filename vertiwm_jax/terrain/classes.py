@@ -11,7 +11,7 @@ from vertiwm_jax.terrain.soil import Soil
 
 @dataclass(frozen=True)
 class GroundClasses:
-    """What the ids `0..K-1` of a semantic raster mean; a class with a soil is deformable.
+    """The meaning of the ids `0..K-1` of a semantic raster. A class with a soil is deformable.
 
     rgb: `[K, 3]` uint8 palette.
     friction: `[K]` mean friction coefficient; 0 for soils.
@@ -60,4 +60,4 @@ STANDARD = GroundClasses(
 
 FIRST_DEFORMABLE = 7
 FRICTION_LIMITS = (0.1, 1.0)
-"""Bounds of a patch's friction coefficient, once drawn."""
+"""Bounds of drawn friction coefficients."""

@@ -1,4 +1,4 @@
-"""A map corrected by measurements on the way: its arrays change, and nothing compiles anew."""
+"""Corrects a map by measurements while driving. Only arrays change, so nothing compiles again."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ def heights(terrain: TerrainMap, corner: jax.Array, measured: jax.Array) -> Terr
     """The map with measured heights in its selected world.
 
     measured: `[h, w]` m, on the vertices south and east of the one nearest to `[2]` corner, p_world
-    in m. NaN, and what lies off the map, leaves the map as it is. Other shapes raise `ValueError`.
+    in m. NaN, and values off the map, change nothing. Other shapes raise `ValueError`.
     """
     _check_shapes(corner, measured=measured)
     column, row = _offset(terrain, corner) / terrain.resolution
@@ -27,8 +27,8 @@ def classes(
     """The map with measured ground classes in its selected world.
 
     semantic: `[h, w]` class ids, on the cells south and east of the one in which `[2]` corner lies,
-    p_world in m. friction: `[h, w]` friction coefficients; not used on soil. Ids of no class, and
-    what lies off the map, leave the map as it is. Other shapes raise `ValueError`.
+    p_world in m. friction: `[h, w]` friction coefficients; not used on soil. Unknown ids,
+    and values off the map, change nothing. Other shapes raise `ValueError`.
     """
     _check_shapes(corner, semantic=semantic, friction=friction)
     _, rows, columns = terrain.elevation.shape
@@ -60,7 +60,7 @@ def _pasted(
     patch: jax.Array,
     known: jax.Array,
 ) -> jax.Array:
-    """The layer `[W, R, C]` with what is known of a patch, whose first row and column are given."""
+    """The layer `[W, R, C]` with the known values of a patch at the given first row and column."""
     row, column = (x.astype(jnp.int32) for x in place)
     i = row + jnp.arange(patch.shape[0])[:, None]
     j = column + jnp.arange(patch.shape[1])

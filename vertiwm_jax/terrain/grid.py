@@ -1,9 +1,9 @@
-"""The rasters of a map: where coordinates fall in them, and what is written there.
+"""Reads the rasters of a map at coordinates.
 
 Every gather is a flat index into the stacked worlds, clipped first and then promised in bounds,
 so that a batch of vehicles on different worlds is one gather and copies no map. Outside the map
 the ground continues level from its edge; a NaN coordinate reads the first row or column. Where
-a map has a belief, what it does not know is answered by what it guesses.
+a map has a belief, unknown ground is that which the belief assumes.
 """
 
 import jax

@@ -1,4 +1,4 @@
-"""Obstacles: axis-aligned boxes that stand on the ground; those whose middle is known."""
+"""Obstacles: axis-aligned boxes on the ground, as far as their middle is known."""
 
 import jax
 import jax.numpy as jnp
@@ -30,9 +30,9 @@ def gap(
 ) -> jax.Array:
     """`[...]` m between the rectangles of `collides` and the nearest obstacle; inf without any.
 
-    Separating-axis test on the two axes of the map and the two of the body, whichever shows more:
-    never more than the distance, and less past corners. Where they touch it is not positive, and
-    says how far in. Obstacles that are not known are not there.
+    This is the largest gap on the two axes of the map and the two of the body (separating-axis
+    test): never more than the distance, and less past corners. Where they touch it is not
+    positive, and says how deep. Unknown obstacles do not count.
     """
     obstacles = terrain.obstacles[terrain.world]
     there = obstacles[:, 4] > 0

@@ -1,4 +1,4 @@
-"""Asking the map for the ground under points; `grid` says what lies off the map."""
+"""The ground under points of a map; `grid` says what lies off the map."""
 
 import jax
 import jax.numpy as jnp
@@ -59,7 +59,7 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
 
 
 def soil(terrain: TerrainMap, semantic: jax.Array) -> Soil:
-    """The soils `[...]` of ground classes `[...]` in the selected world; of rigid ones any."""
+    """The soils `[...]` of ground classes `[...]` in the selected world; rigid ones have any."""
     return jax.tree.map(lambda leaf: leaf[semantic], soils(terrain))
 
 

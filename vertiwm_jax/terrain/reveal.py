@@ -1,4 +1,4 @@
-"""Maps that become known on the way: what a vehicle has seen of its world, and what it guesses."""
+"""Limited sensing: what a vehicle has seen of its map, and what it assumes of the rest."""
 
 import math
 from dataclasses import replace
@@ -14,29 +14,29 @@ from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.map import TerrainMap
 
 NEAR = 4.0
-"""Metres around a vehicle that it knows, wherever it looks: what it stands on."""
+"""Distance, m, within which a vehicle knows the ground in all directions."""
 _RINGS, _DIRECTIONS = 6, 12  # of the places in view that the plane is laid through
 
 
 @settings
 class RevealConfig:
-    """How far sensors see, which reveal the map; all of it is known from the start by default."""
+    """What sensors see of the map; by default all of it is known from the start."""
 
     range: Positive = math.inf
-    """Metres at which the ground, and obstacles by their middle, are seen."""
+    """Distance, m, at which ground, and obstacles by their middle, are seen."""
     field_of_view: Annotated[float, Bounds(0, 2 * math.pi, above=True)] = 2 * math.pi
-    """Angle about straight ahead, rad, in which they are; what is nearer than 4 m always is."""
+    """Angle of view, rad, centred ahead. Ground nearer than 4 m is always seen."""
     cells: Count = 64
-    """Cells along each side of the map, each of which is known or not."""
+    """Cells along each side of the map; each cell is known or not."""
 
     @property
     def partial(self) -> bool:
-        """Whether anything is unknown at the start."""
+        """Whether some of the map is unknown at the start."""
         return math.isfinite(self.range)
 
 
 def check(config: RevealConfig, terrain: TerrainMap) -> None:
-    """`ValueError` if cells are so large that one is not seen where the vehicle stands in it."""
+    """`ValueError` if cells are so large that a vehicle may not see the cell that it stands in."""
     rows, columns = terrain.elevation.shape[-2:]
     width, height = (float(terrain.resolution) * (n - 1) for n in (columns, rows))
     near = min(config.range, NEAR)
@@ -51,7 +51,7 @@ def check(config: RevealConfig, terrain: TerrainMap) -> None:
 def begin(
     config: RevealConfig, terrain: TerrainMap, position: jax.Array, yaw: jax.Array
 ) -> MapBelief | None:
-    """What a vehicle sees first at `[3]` p_world, m, and `[]` yaw, rad; None if it knows all."""
+    """The first belief at `[3]` p_world, m, and `[]` yaw, rad; None if all is known."""
     if not config.partial:
         return None
     below = query.surface(terrain, position[:2])
@@ -71,10 +71,11 @@ def look(
     position: jax.Array,
     yaw: jax.Array,
 ) -> MapBelief:
-    """The belief with what is seen at `[3]` p_world, m, and `[]` yaw, rad.
+    """The belief after looking around at `[3]` p_world, m, and `[]` yaw, rad.
 
-    Cells are seen by their middle, and stay known. Unknown ground is guessed to lie in the plane
-    of least squares through the ground in view, and to be as the ground below the vehicle.
+    A cell is seen where its middle is, and stays known. Unknown ground is assumed to lie in the
+    least-squares plane through the ground in view, with class and friction of the ground below the
+    vehicle.
     """
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     middles = (np.arange(config.cells, dtype=np.float32) + 0.5) / config.cells

@@ -35,7 +35,7 @@ class Soil:
 def _soil(
     kc: float, kphi: float, n: float, cohesion: float, phi: float, k: float, weight: float
 ) -> Soil:
-    """A preset from kN, kPa and degrees. NumPy leaves: importing must not start a device."""
+    """A preset from kN, kPa and degrees. Leaves are NumPy's, since importing must not start JAX."""
     si = (1e3 * kc, 1e3 * kphi, n, 1e3 * cohesion, radians(phi), k, 1e3 * weight)
     return Soil(*(cast(jax.Array, np.asarray(value, np.float32)) for value in si))
 
@@ -70,7 +70,7 @@ PRESETS: dict[str, Soil] = {
 
 
 def stack(soils: Sequence[Soil]) -> Soil:
-    """S soils with leaves `[...]` to one with leaves `[S, ...]`, float32."""
+    """Stacks S soils with leaves `[...]` to one with leaves `[S, ...]`, float32."""
     if not soils:
         raise ValueError("stack: expected at least one soil, found none")
     return jax.tree.map(
@@ -81,7 +81,7 @@ def stack(soils: Sequence[Soil]) -> Soil:
 def reece_moduli(
     k1: jax.Array | float, k2: jax.Array | float, n: jax.Array | float, width: jax.Array | float
 ) -> tuple[jax.Array | float, jax.Array | float]:
-    """Bekker's kc and kphi that press like Reece's (k1 + k2 width)(z / width)^n, all `[...]`.
+    """Bekker's kc and kphi for Reece's pressure (k1 + k2 width)(z / width)^n, all `[...]`.
 
     k1: Pa. k2: Pa/m. width: m, the smaller side of the contact; the moduli hold for it alone.
     Source: Reece (1965); Wong and Reece, J. Terramechanics 4(1) (1967).

@@ -1,7 +1,7 @@
-"""The worlds of a Verti-Bench checkout (RobotiXX/verti_bench).
+"""Reads the worlds of a Verti-Bench checkout (RobotiXX/verti_bench).
 
-Gray height maps of one vertex a metre, 8 m patches with a class and a friction, and rocks and
-trees. Soils are put where the labels are, which is not where that simulator puts them.
+A world has a gray height map with one vertex a metre, patches of 8 m with a class and a friction,
+and rocks and trees. Soils are where the labels say, which differs from that simulator.
 """
 
 import re
@@ -21,7 +21,7 @@ _FOLDER = Path("envs/data/BenchMaps/sampled_maps")
 
 
 def load(folder: str | Path, numbers: Iterable[int] | None = None) -> TerrainMap:
-    """Worlds of a checkout, stacked: those of `numbers`, in that order, or all, by number.
+    """Stacks the worlds `numbers` of a checkout, in that order; by default all of them.
 
     Raises `MapError` naming the file and the field.
     """

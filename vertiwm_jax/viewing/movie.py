@@ -1,4 +1,4 @@
-"""A scene as a movie: the map from above, which follows the vehicle, over strips of time."""
+"""Draws a scene as a movie: the map from above, which follows the vehicle, and time series."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Show = Callable[[int], None]
 
 
 def check(path: Path) -> None:
-    """`ConfigError`, which names the movie, without the package that writes it."""
+    """Raises `ConfigError` if the package that writes such a movie is missing."""
     WRITERS[path.suffix](path)
 
 
@@ -60,7 +60,7 @@ def write(scene: Scene, path: Path) -> None:
 
 
 def draw(scene: Scene) -> tuple[Figure, Show]:
-    """The figure, and what puts all that moves in it where it is at a step."""
+    """The figure, and a function that moves everything in it to its place at a step."""
     strips = {name: lines for name, lines in panels(scene).items() if name in _LABELS}
     figure = plots.sheet(6.4, 4.2 + 1.15 * len(strips))
     overhead, *below = figure.subplots(1 + len(strips), 1, height_ratios=[4, *(1 for _ in strips)])
@@ -172,7 +172,7 @@ def _legend_above(axes: Axes) -> None:
 
 
 def _turned(points: np.ndarray, angle: float) -> np.ndarray:
-    """Points `[..., 2]` turned to the left by `angle`, rad."""
+    """Points `[..., 2]` rotated to the left by `angle`, rad."""
     cos, sin = np.cos(angle), np.sin(angle)
     return points @ np.array([(cos, sin), (-sin, cos)])
 
@@ -182,7 +182,7 @@ def _gif(path: Path) -> AbstractMovieWriter:
     from PIL import Image
 
     class OnePalette(PillowWriter):
-        """The same colours in all frames, so that what did not move is not stored again."""
+        """Writes GIFs with one palette, so that pixels that do not change are not stored again."""
 
         def finish(self) -> None:
             some = self._frames[:: max(1, len(self._frames) // 8)]

@@ -1,4 +1,4 @@
-"""A scene as a recording for the rerun viewer: a world in three dimensions, and plots over time."""
+"""Writes a scene as a recording for the rerun viewer: the world in 3D, and plots over time."""
 
 from functools import partial
 from pathlib import Path
@@ -124,7 +124,7 @@ def _vehicle(stream: rr.RecordingStream, scene: Scene) -> None:
 
 
 def _body(scene: Scene, **style: Any) -> rr.Boxes3D:
-    """Two boxes: the cabin, behind the bonnet, tells the front from the rear."""
+    """Two boxes: bonnet and cabin, so that the front can be told from the rear."""
     vehicle, heights = scene.vehicle, np.asarray(scene.vehicle.hull)[:, 2]
     low, high = heights.min(), heights.max()
     waist = (low + high) / 2
@@ -137,7 +137,7 @@ def _body(scene: Scene, **style: Any) -> rr.Boxes3D:
 
 
 def _wheel(stream: rr.RecordingStream, scene: Scene, i: int, entity: str) -> None:
-    """Wheel `i` at its place in the body, with a spoke that tells how far it has turned."""
+    """Wheel `i` at its place in the body, with a spoke that shows its rotation."""
     radius, width = float(scene.vehicle.wheel_radius), float(scene.vehicle.wheel_width)
     turned, steered = scene.turned[:, i], scene.steering[:, i]
     attitude = np.stack([np.zeros_like(turned), turned, steered], axis=1)

@@ -1,4 +1,4 @@
-"""What is shown of a drive, whoever drove it."""
+"""The data of a drive that recordings and movies show."""
 
 from dataclasses import dataclass, field
 
@@ -19,12 +19,12 @@ Panels = dict[str, dict[str, np.ndarray]]
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a model predicts open loop from N states of a drive, H steps each.
+    """Open-loop predictions of H steps from N states of a drive.
 
-    start: `[N]` the steps of the drive that it starts from.
-    state: `[N, H + 1, 12]`, of which the first are those of the drive.
-    coefficients: `[N, H, 4]` alpha of the steps; None of a model that does not fuse.
-    sinkage: `[N, H, 4]` m of the wheels after them; None of a model without wheels.
+    start: `[N]` steps of the drive at which predictions start.
+    state: `[N, H + 1, 12]`; the first of each is recorded.
+    coefficients: `[N, H, 4]` fusion coefficients; None if the model does not fuse.
+    sinkage: `[N, H, 4]` of the wheels, m; None if the model has no wheels.
     """
 
     start: np.ndarray
@@ -41,7 +41,7 @@ class Prediction:
 
     @property
     def states(self) -> np.ndarray:
-        """`[N, H, 12]` without those that it starts from."""
+        """`[N, H, 12]` the predicted states, without the recorded first ones."""
         return self.state[:, 1:]
 
 
@@ -51,10 +51,11 @@ class Scene:
 
     title: in a few words.
     state: `[T + 1, 12]`; command: `[T, 2]` m/s and rad.
-    wheels: leaves `[T + 1, ...]`, as far as they are known; None of a model without wheels.
-    coefficients: `[T + 1, 4]` alpha that led to each state; None where nothing was fused.
-    goal: `[3]` m, reached within `goal_radius` m; None of a drive without one.
-    prediction: what a model says of the drive.
+    wheels: leaves `[T + 1, ...]`, where known; None if the model has no wheels.
+    coefficients: `[T + 1, 4]` fusion coefficients of the step to each state; None if the model
+        does not fuse.
+    goal: `[3]` m, reached within `goal_radius` m; None if the drive has no goal.
+    prediction: open-loop predictions of a model, if any.
     """
 
     title: str
@@ -70,12 +71,12 @@ class Scene:
 
     @property
     def steps(self) -> int:
-        """T."""
+        """T, the number of steps."""
         return len(self.command)
 
     @property
     def world(self) -> int:
-        """Which of the worlds of the map."""
+        """Index of the selected world."""
         return int(self.terrain.world)
 
     @property
@@ -85,12 +86,12 @@ class Scene:
 
     @property
     def commanded(self) -> np.ndarray:
-        """`[T + 1, 2]` the command at each state; the last one goes on."""
+        """`[T + 1, 2]` the command at each state; the last command is repeated."""
         return self.command[np.minimum(np.arange(self.steps + 1), self.steps - 1)]
 
     @property
     def steering(self) -> np.ndarray:
-        """`[T + 1, 4]` rad, angle of each wheel to the left; as commanded where it is not known."""
+        """`[T + 1, 4]` angle of each wheel, rad, left positive; as commanded where unknown."""
         front = self.wheels and self.wheels.steer_angle
         if front is None:
             front = np.repeat(self.commanded[:, 1:], 2, axis=1)
@@ -98,7 +99,7 @@ class Scene:
 
     @property
     def turned(self) -> np.ndarray:
-        """`[T + 1, 4]` rad by which each wheel has turned forward; 0 where it is not known."""
+        """`[T + 1, 4]` rotation of each wheel, rad, forward positive; 0 if unknown."""
         speed = self.wheels and self.wheels.wheel_omega
         if speed is None:
             return np.zeros((self.steps + 1, 4))
@@ -106,7 +107,7 @@ class Scene:
 
 
 def panels(scene: Scene) -> Panels:
-    """What is drawn over time: by title and then by name, `[T + 1]`, NaN where there is nothing."""
+    """Time series to plot, `[T + 1]` by panel title and name; NaN where a value is unknown."""
     shown: Panels = {
         TILT: {
             "roll": np.degrees(scene.state[:, 3]),
