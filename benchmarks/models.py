@@ -65,7 +65,7 @@ def driving(
         params: Params, terrain: TerrainMap, start: VehicleState, commands: Command
     ) -> VehicleState:
         history = model.init(params, terrain, start)
-        return rollout(model, params, terrain, history, start, commands)
+        return rollout(model, params, terrain, start, commands, history)
 
     return drive, params
 

@@ -23,7 +23,7 @@ def rates(name: ModelName, batches: tuple[int, ...]) -> dict[str, Figures]:
     ) -> jax.Array:
         def one(start: VehicleState, command: Command) -> jax.Array:
             history = model.init(params, terrain, start)
-            end = rollout(model, params, terrain, history, start, command).position[-1]
+            end = rollout(model, params, terrain, start, command, history).position[-1]
             return jnp.sum((end - start.position) ** 2)
 
         return jnp.mean(jax.vmap(one)(starts, commands))

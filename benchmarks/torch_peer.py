@@ -84,7 +84,7 @@ def ours(model: VertiWM, params: VertiWMParams) -> Callable[[Drives], Roll]:
     ) -> jax.Array:
         ground = terrain.select(world)
         history = model.init(params, ground, start)
-        return rollout(model, params, ground, history, start, commands).vector
+        return rollout(model, params, ground, start, commands, history).vector
 
     many = jax.jit(parallel.vmap(drive, in_axes=(None, None, 0, 0, 0)))
 

@@ -1,3 +1,51 @@
 """Fast, differentiable world models for off-road reinforcement learning, in JAX."""
 
+from typing import TYPE_CHECKING
+
+from vertiwm_jax._lazy import lazy
+
+if TYPE_CHECKING:
+    from vertiwm_jax.dynamics import Dynamics as Dynamics
+    from vertiwm_jax.dynamics import rollout as rollout
+    from vertiwm_jax.env.agent import Agent as Agent
+    from vertiwm_jax.env.navigation import NavigationEnv as NavigationEnv
+    from vertiwm_jax.env.navigation import make_env as make_env
+    from vertiwm_jax.evaluation.prediction import prediction_errors as prediction_errors
+    from vertiwm_jax.learning.dataset import load_drives as load_drives
+    from vertiwm_jax.mechanics.kinematic import place as place
+    from vertiwm_jax.mechanics.vehicle import Vehicle as Vehicle
+    from vertiwm_jax.mechanics.vehicle import load_vehicle as load_vehicle
+    from vertiwm_jax.rl.mppi import MPPI as MPPI
+    from vertiwm_jax.state import Command as Command
+    from vertiwm_jax.state import VehicleState as VehicleState
+    from vertiwm_jax.terrain.files import load_map as load_map
+    from vertiwm_jax.terrain.map import TerrainMap as TerrainMap
+    from vertiwm_jax.terrain.worlds import make_worlds as make_worlds
+    from vertiwm_jax.world_model.choice import load_model as load_model
+
 __version__ = "0.1.0"
+_PUBLIC = {
+    "Agent": "env.agent",
+    "Command": "state",
+    "Dynamics": "dynamics",
+    "MPPI": "rl.mppi",
+    "NavigationEnv": "env.navigation",
+    "TerrainMap": "terrain.map",
+    "Vehicle": "mechanics.vehicle",
+    "VehicleState": "state",
+    "load_drives": "learning.dataset",
+    "load_map": "terrain.files",
+    "load_model": "world_model.choice",
+    "load_vehicle": "mechanics.vehicle",
+    "make_env": "env.navigation",
+    "make_worlds": "terrain.worlds",
+    "place": "mechanics.kinematic",
+    "prediction_errors": "evaluation.prediction",
+    "rollout": "dynamics",
+}
+__all__ = [*_PUBLIC]  # pyright: ignore[reportUnsupportedDunderAll]
+__getattr__ = lazy(__name__, _PUBLIC)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_PUBLIC]

@@ -90,11 +90,11 @@ def settings(cls: type[T]) -> type[T]:
     """
 
     def check_all(self: Any) -> None:
-        for name, bounds in _bounds_of_fields(type(self)):
+        for name, bounds, options in _bounds_of_fields(type(self)):
             value = getattr(self, name)
             if bounds is AtLeastOne:
                 if not value:
-                    raise ConfigError(f"{name}: expected at least one, found none")
+                    raise ConfigError(f"{name}: expected at least one{options}, found none")
             elif value is not None:
                 numbers = value if isinstance(value, tuple) else (value,)
                 if not all(number in bounds for number in numbers):
@@ -111,17 +111,23 @@ def settings(cls: type[T]) -> type[T]:
 
 
 @functools.cache
-def _bounds_of_fields(cls: Any) -> list[tuple[str, Any]]:
-    hints = get_type_hints(cls, include_extras=True)
-    fields = dataclasses.fields(cls)
-    return [(field.name, bounds) for field in fields for bounds in _bounds(hints[field.name])]
+def _bounds_of_fields(cls: Any) -> list[tuple[str, Any, str]]:
+    """Of each field that has some: name, bounds, and what may be chosen, if anything."""
+    hints, found = get_type_hints(cls, include_extras=True), []
+    for field in dataclasses.fields(cls):
+        parts = list(_parts(hints[field.name]))
+        options = [part for part in parts if isinstance(part, str)]
+        told = f" of {', '.join(options)}" if options else ""
+        bounds = (part for part in parts if isinstance(part, Bounds) or part is AtLeastOne)
+        found += [(field.name, each, told) for each in bounds]
+    return found
 
 
-def _bounds(kind: Any) -> Iterator[Any]:
+def _parts(kind: Any) -> Iterator[Any]:
+    """All that the annotation is made of."""
     for part in get_args(kind):
-        if isinstance(part, Bounds) or part is AtLeastOne:
-            yield part
-        yield from _bounds(part)
+        yield part
+        yield from _parts(part)
 
 
 def default_config(name: str) -> Path:

@@ -104,11 +104,26 @@ def rollout(
     dynamics: Dynamics,
     params: Params,
     terrain: TerrainMap,
-    history: History,
     state: VehicleState,
     commands: Command,
+    history: History = None,
 ) -> VehicleState:
-    """Open-loop prediction: `commands` leaves `[T]` to the next T states, leaves `[T, 3]`."""
+    """Drives a vehicle in a model: open-loop prediction.
+
+    Args:
+        dynamics, params: the model, and its parameters.
+        terrain: the map, with the world selected that is driven on.
+        state: the first state of the vehicle, leaves `[3]`.
+        commands: one a step of 0.1 s, leaves `[T]`: speed in m/s, steering angle in rad.
+        history: what the model remembers of the drive before; by default that of a vehicle that
+            has only just begun.
+
+    Returns:
+        The T states that follow, leaves `[T, 3]`: position in m and roll, pitch and yaw in rad in
+        the frame of the world, velocity in m/s and angular velocity in rad/s in that of the body.
+    """
+    if history is None:
+        history = dynamics.init(params, terrain, state)
 
     def advance(
         carry: tuple[VehicleState, History], command: Command

@@ -44,7 +44,7 @@ def test_a_suite_alone_has_the_same_worlds(procedural):
     _, terrain = suites.grounds(alone, None, jax.random.key(0))
     np.testing.assert_array_equal(terrain.elevation, procedural[1].elevation[4:])
     np.testing.assert_array_equal(terrain.obstacles, procedural[1].obstacles[4:])
-    with pytest.raises(ValueError, match="suites: expected some of easy, hard, obstacles"):
+    with pytest.raises(ValueError, match="suites: expected at least one of easy, hard, obstacles"):
         replace(CONFIG, suites=())
 
 

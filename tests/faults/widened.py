@@ -50,9 +50,7 @@ def drive(model: Dynamics, params: Any) -> VehicleState:
     start = VehicleState(position, rpy, jnp.zeros(3), jnp.zeros(3))
     commands = Command(jnp.full(5, 3.0), jnp.full(5, 0.1))
     return jax.eval_shape(
-        lambda params: rollout(
-            model, params, terrain, model.init(params, terrain, start), start, commands
-        ),
+        lambda params: rollout(model, params, terrain, start, commands),
         params,
     )
 

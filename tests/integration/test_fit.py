@@ -80,7 +80,7 @@ def test_every_stage_leaves_its_metrics_and_all_together_a_model(run, folder):
     for name in ("transformer", "nesam", "vertiwm", "builtin"):
         dynamics, params = choose(name, run / "model")
         history = dynamics.init(params, ground, state)
-        states = rollout(dynamics, params, ground, history, state, commands)
+        states = rollout(dynamics, params, ground, state, commands, history)
         ends[name] = np.asarray(states.position[-1])
         assert np.linalg.norm(ends[name] - drives.state[0, 3, :3]) < 0.3, name
     assert len({tuple(end) for end in ends.values()}) == 4

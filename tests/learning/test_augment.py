@@ -160,7 +160,7 @@ def test_the_simulator_drives_the_mirror_image_of_what_it_drives():
         start = jax.tree.map(lambda x: x[C], states)
         context, ahead = (Command.from_vector(c) for c in (control[:C], control[C:]))
         history = warm_up(simulator, params, ground, before, context)
-        return rollout(simulator, params, ground, history, start, ahead).vector
+        return rollout(simulator, params, ground, start, ahead, history).vector
 
     def predicted(windows):
         return predict(windows.state, windows.control, windows.world)

@@ -103,7 +103,7 @@ def test_driving_out_of_deep_snow_onto_concrete_is_climbing_a_step():
     @jax.jit
     def speeds(terrain: TerrainMap) -> jax.Array:
         history = simulator.init(params, terrain, start)
-        driven = rollout(simulator, params, terrain, history, start, commands)
+        driven = rollout(simulator, params, terrain, start, commands, history)
         return driven.velocity[10:, 0]
 
     in_snow, out_of_it = speeds(halves(SNOW, SNOW)), speeds(halves(SNOW, CONCRETE))

@@ -59,7 +59,7 @@ def test_bicycle_drives_a_circle(steering):
     ground, steps, speed = plane(0, 0), 100, 2.0
     state = VehicleState.from_vector(jnp.zeros(12).at[2].set(50.45).at[6].set(speed))
     commands = Command(jnp.full(steps, speed), jnp.full(steps, steering))
-    driven = rollout(KinematicBicycle(), PARAMS, ground, (), state, commands)
+    driven = rollout(KinematicBicycle(), PARAMS, ground, state, commands)
 
     x, y = np.asarray(driven.position[20:, :2], np.float64).T
     centre_x, centre_y, c = np.linalg.lstsq(
@@ -81,7 +81,7 @@ def test_bicycle_drives_a_circle(steering):
 def test_bicycle_approaches_the_commanded_speed_with_its_lag():
     state = VehicleState.from_vector(jnp.zeros(12).at[2].set(50.45))
     commands = Command(jnp.full(3, 3.0), jnp.zeros(3))
-    driven = rollout(KinematicBicycle(), PARAMS, plane(0, 0), (), state, commands)
+    driven = rollout(KinematicBicycle(), PARAMS, plane(0, 0), state, commands)
     np.testing.assert_allclose(driven.velocity[:, 0], 3 * (1 - np.exp([-1 / 3, -2 / 3, -1])), 1e-5)
 
 
@@ -92,7 +92,7 @@ def test_bicycle_climbs_at_its_speed_along_the_slope():
     )
     state = VehicleState(position, rpy, jnp.array([2.0, 0, 0]), jnp.zeros(3))
     commands = Command(jnp.full(50, 2.0), jnp.zeros(50))
-    driven = rollout(KinematicBicycle(), PARAMS, ground, (), state, commands)
+    driven = rollout(KinematicBicycle(), PARAMS, ground, state, commands)
     along = np.linalg.norm(np.asarray(driven.position[-1] - state.position))
     assert along == pytest.approx(10.0, rel=1e-3)
 

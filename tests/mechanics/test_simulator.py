@@ -291,7 +291,7 @@ def final() -> Callable[..., tuple[jax.Array, tuple]]:
 
     def total(state, commands, params, terrain, weight):
         history = SIMULATOR.init(params, terrain, state)
-        states = rollout(SIMULATOR, params, terrain, history, state, commands)
+        states = rollout(SIMULATOR, params, terrain, state, commands, history)
         return states.position[-1] @ weight
 
     def by_soil(state, commands, params, soils, terrain, weight):
@@ -382,7 +382,7 @@ def test_derivatives_along_a_direction_agree_with_differences():
         terrain = replace(terrain, soils=replace(terrain.soils, kphi=kphi * terrain.soils.kphi))
         history = SIMULATOR.init(params, terrain, state)
         commands = Command(jnp.full(8, speed), jnp.full(8, steering))
-        states = rollout(SIMULATOR, params, terrain, history, state, commands)
+        states = rollout(SIMULATOR, params, terrain, state, commands, history)
         return states.position[-1] @ jnp.array([1.0, 0.7, 0.3])
 
     @jax.jit
@@ -421,7 +421,7 @@ def test_a_batch_is_a_loop_and_commands_do_not_retrace():
         nonlocal traces
         traces += 1
         history = SIMULATOR.init(PARAMS, terrain, state)
-        return rollout(SIMULATOR, PARAMS, terrain, history, state, commands)
+        return rollout(SIMULATOR, PARAMS, terrain, state, commands, history)
 
     starts = [at_rest(terrain, x, y, yaw) for x, y, yaw in ((0, 0, 0), (5, 3, 2), (-4, 6, -1))]
     commands = Command(jnp.array([1.0, 3.0, 0.0]), jnp.array([0.3, -0.1, 0.0]))
@@ -441,8 +441,6 @@ def test_few_substeps_are_enough():
     state = at_rest(terrain)
     fine = Simulator(substeps=20)
     commands = Command(jnp.full(16, 3.0), jnp.full(16, 0.2))
-    reference = rollout(
-        fine, PARAMS, terrain, fine.init(PARAMS, terrain, state), state, commands
-    ).position
+    reference = rollout(fine, PARAMS, terrain, state, commands).position
     coarse = drive(terrain, state, 3.0, 0.2).state.position[:16]
     np.testing.assert_allclose(coarse, reference, atol=0.08)

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vertiwm_jax.dynamics import rollout
-from vertiwm_jax.env import tasks
+from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import GRAVITY, hmmwv
 from vertiwm_jax.simulators import chrono
@@ -113,8 +113,8 @@ def test_the_built_in_simulator_is_the_one_inside_jit():
 
     @jax.jit
     def inside(commands):
-        start = tasks.place(terrain, hmmwv(), jnp.array([160.0, 5.0]), jnp.float32(1.0))
-        return rollout(model, params, terrain, model.init(params, terrain, start), start, commands)
+        start = place(terrain, jnp.array([160.0, 5.0]), jnp.float32(1.0))
+        return rollout(model, params, terrain, start, commands)
 
     commands = np.concatenate([np.zeros((15, 2), np.float32), commands])
     states = inside(Command.from_vector(jnp.asarray(commands))).vector

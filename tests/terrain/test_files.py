@@ -145,7 +145,7 @@ def test_what_is_no_map_is_named(tmp_path):
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(MapError, match=r"cut.npz: file: expected an .npz map"):
         files.load(tmp_path / "cut.npz")
-    with pytest.raises(MapError, match=r"absent.npz: file: .*No such file"):
+    with pytest.raises(MapError, match=r"absent.npz: file: .*no such file"):
         files.load(tmp_path / "absent.npz")
     (tmp_path / "empty").mkdir()
     with pytest.raises(MapError, match=r"empty: folder: expected one .npz map or more"):

@@ -22,7 +22,7 @@ TERRAIN, STATES, COMMANDS = rough(), driving(3, 5), commands(8)
 def drive(model, params, states):
     def of_one(state):
         history = model.init(params, TERRAIN, state)
-        return rollout(model, params, TERRAIN, history, state, COMMANDS)
+        return rollout(model, params, TERRAIN, state, COMMANDS, history)
 
     return jax.vmap(of_one)(states)
 
@@ -76,7 +76,7 @@ def test_what_needs_latents_is_refused():
 def away(model, params, network, commands):
     params, state = replace(params, network=network), one(STATES, 0)
     history = model.init(params, TERRAIN, state)
-    return jnp.sum(rollout(model, params, TERRAIN, history, state, commands).position[-1])
+    return jnp.sum(rollout(model, params, TERRAIN, state, commands, history).position[-1])
 
 
 by_commands = jax.jit(jax.grad(away, argnums=3), static_argnums=0)

@@ -100,7 +100,7 @@ def step(params, terrain, history, state, command, model=MODEL):
 def alone(params, terrain, state, commands, model):
     """The states of a rollout of one specialist."""
     history = model.init(params, terrain, state)
-    return rollout(model, params, terrain, history, state, commands)
+    return rollout(model, params, terrain, state, commands, history)
 
 
 def fuse(params, terrain, state, commands, model=MODEL):
@@ -327,7 +327,7 @@ def test_gate_learns_through_time_with_finite_gradients():
     history, control = init(PARAMS, TERRAIN, STATE), commands(16, seed=2)
 
     def loss(gate, state):
-        states = rollout(MODEL, replace(PARAMS, gate=gate), TERRAIN, history, state, control)
+        states = rollout(MODEL, replace(PARAMS, gate=gate), TERRAIN, state, control, history)
         return jnp.sum((states.position[-1] - 3.0) ** 2)
 
     by_gate, by_state = jax.jit(jax.grad(loss, argnums=(0, 1)))(PARAMS.gate, STATE)

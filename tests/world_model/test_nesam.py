@@ -71,7 +71,7 @@ def standing(seed: int = 0, *batch: int) -> VehicleState:
 
 def predict(model, params, state, control, terrain=TERRAIN):
     history = model.init(params, terrain, state)
-    return rollout(model, params, terrain, history, state, control)
+    return rollout(model, params, terrain, state, control, history)
 
 
 @cache

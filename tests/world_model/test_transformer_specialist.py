@@ -32,7 +32,7 @@ PARAMS = {kind: moved(params) for kind, params in UNTRAINED.items()}
 
 def predict(params, terrain, state, commands, model=MODEL):
     history = model.init(params, terrain, state)
-    return rollout(model, params, terrain, history, state, commands)
+    return rollout(model, params, terrain, state, commands, history)
 
 
 predicted = jax.jit(predict, static_argnames="model")
@@ -192,7 +192,7 @@ def test_gradients_through_a_warmed_up_rollout_are_finite():
     def loss(params, drive):
         history = warm_up(MODEL, params, TERRAIN, drive, before)
         state = jax.tree.map(lambda x: x[-1], drive)
-        return jnp.sum(rollout(MODEL, params, TERRAIN, history, state, after).position[-1])
+        return jnp.sum(rollout(MODEL, params, TERRAIN, state, after, history).position[-1])
 
     gradient, by_drive = jax.jit(jax.grad(loss, argnums=(0, 1)))(PARAMS["patches"], drive)
     leaves = jax.tree.leaves((gradient, by_drive))

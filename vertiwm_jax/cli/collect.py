@@ -15,9 +15,7 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
 from vertiwm_jax.cli import arguments, export
 from vertiwm_jax.config import Bounds, ConfigError, Count, settings
-from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Policy
-from vertiwm_jax.env.suites import GroundConfig
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig
@@ -167,7 +165,7 @@ def record(task: Task) -> Drive:
 def _terrain(command: Collect, scale: float) -> TerrainMap:
     """All worlds to drive on."""
     if command.worlds:
-        return suites.load(GroundConfig(obstacles=command.obstacles), command.worlds, scale)
+        return files.load_map(command.worlds, scale=scale, obstacles=command.obstacles)
     config = WorldConfig(command.difficulties, command.kinds)
     count = command.repeats * len(command.difficulties) * len(command.kinds)
     return worlds.generate(jax.random.split(jax.random.key(command.seed), count), config, scale)

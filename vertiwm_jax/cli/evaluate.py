@@ -15,7 +15,6 @@ from vertiwm_jax.cli import arguments
 from vertiwm_jax.cli.fit import FitConfig
 from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, settings
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.env import suites
 from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.suites import Suite
@@ -41,6 +40,7 @@ from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
 from vertiwm_jax.rl.planning import PlanningConfig
 from vertiwm_jax.rl.shooting import Shooting, ShootingConfig
 from vertiwm_jax.simulators import processes
+from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain.soil import PRESETS
 from vertiwm_jax.world_model.choice import ModelName, choose, exact, fitted
 from vertiwm_jax.world_model.nesam import SoilSource
@@ -261,7 +261,10 @@ def _navigate(command: Navigation) -> None:
     config = _adapted(trained, command)
     external.expect(command.simulator, config)
     maps, scale = command.worlds, config.driven.scale
-    terrain = suites.load(config.ground, maps, scale) if maps else experiment.held_out(config)
+    if maps:
+        terrain = files.load_map(maps, scale=scale, obstacles=config.ground.obstacles)
+    else:
+        terrain = experiment.held_out(config)
     test = external.test_in(command.simulator, config, terrain)
     policies = config.baselines
     if run:

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -10,18 +11,20 @@ import jax.numpy as jnp
 from gymnax.environments import environment, spaces
 
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE, Dynamics, Params, disagreement, spread, step
-from vertiwm_jax.env import observation
+from vertiwm_jax.env import observation, suites
 from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
 from vertiwm_jax.env.resets import ResetPool
 from vertiwm_jax.env.reward import reward
+from vertiwm_jax.env.suites import GroundConfig
 from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState, see
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason, edge_distance, first_ending, is_terminal
-from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
+from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, hmmwv, load_vehicle
 from vertiwm_jax.networks.policy import Senses
 from vertiwm_jax.state import STEP_SECONDS, VehicleState
 from vertiwm_jax.terrain import obstacles, query, reveal
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model.choice import Imagined, lean, load_model
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,3 +223,44 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
             & (jnp.abs(off_ground) <= self.config.plausible_height)
             & (apart <= self.config.plausible_disagreement)
         )
+
+
+def make_env(
+    terrain: TerrainMap | None = None,
+    model: Imagined = "builtin",
+    *,
+    vehicle: str = HMMWV,
+    weights: str | Path | None = None,
+    config: NavigationConfig = NavigationConfig(),
+    pairs: int = 10,
+    seed: int = 0,
+) -> tuple[NavigationEnv, TaskParams]:
+    """Makes the task of driving across maps as an environment, a step of which is 0.1 s.
+
+    Args:
+        terrain: W worlds; by default two procedural ones of each suite that policies are tested on.
+        model: what moves the vehicle, see `load_model`.
+        vehicle: name of a vehicle that comes along, or a YAML file of one; learned models move
+            the one that they were fitted to.
+        weights: folder of a fitted model; the one that comes along by default.
+        config: what the task asks.
+        pairs: tasks in a world, each from one point of a circle to the opposite one.
+        seed: draws the default worlds.
+
+    Returns:
+        The environment, and its parameters with a pool of W * `pairs` starts, each settled on the
+        ground by the model. `reset(key, params)` gives an observation `[O]` and a state, and
+        `step(key, state, action, params)` with an action `[2]` in [-1, 1] the next ones, the
+        reward, whether the episode is over, and `info`.
+
+    Raises:
+        TaskError: a task cannot be driven on the map.
+        ConfigError, CheckpointError: there is no such vehicle, or no such model.
+    """
+    driven = load_vehicle(vehicle)
+    if terrain is None:
+        terrain = suites.suite_worlds(GroundConfig(suite_worlds=2), jax.random.key(seed))
+    dynamics, params = load_model(model, weights, vehicle=driven, embeddings=config.embeddings)
+    env = NavigationEnv(dynamics if config.embeddings else lean(dynamics), config)
+    tasks = suites.test_tasks(GroundConfig(pairs=pairs), terrain)
+    return env, env.make_params(params, terrain, tasks, driven)

@@ -14,6 +14,7 @@ from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConf
 from vertiwm_jax.env.route import Routes
 from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState, see
 from vertiwm_jax.env.tasks import TaskError, Tasks
+from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import patches, query, reveal
@@ -128,9 +129,9 @@ def _settle(
         # Made where it is used: from outside of what devices share, it would be another type.
         return Command(jnp.float32(0), jnp.float32(0))
 
-    def place(dynamics: Params, vehicle: Vehicle, terrain: TerrainMap, task: Tasks) -> _Placed:
+    def settle(dynamics: Params, vehicle: Vehicle, terrain: TerrainMap, task: Tasks) -> _Placed:
         selected = terrain.select(task.world)
-        state = tasks.place(selected, vehicle, task.start, task.yaw)
+        state = place(selected, task.start, task.yaw, vehicle=vehicle)
         return state, model.init(dynamics, selected, state)
 
     def stand(dynamics: Params, terrain: TerrainMap, world: jax.Array, placed: _Placed) -> _Placed:
@@ -164,7 +165,7 @@ def _settle(
         believed = dataclasses.replace(selected, belief=state.belief)
         return state, see(config, believed, vehicle, routes.select(number), state)
 
-    placed = parallel.vmap(place, (None, None, None, 0))(dynamics, vehicle, terrain, pool)
+    placed = parallel.vmap(settle, (None, None, None, 0))(dynamics, vehicle, terrain, pool)
     # Steps of all, and not all steps of each: inside of `vmap`, a scan is traced again until it is
     # known what of a history differs between vehicles.
     stand_all = partial(parallel.vmap(stand, (None, None, 0, 0)), dynamics, terrain, pool.world)

@@ -1,7 +1,6 @@
 """Which worlds to train on, which to keep for the test, and the tasks on both."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,11 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax import froude
 from vertiwm_jax.config import AtLeastOne, ConfigError, Count, CountOrZero, NotNegative, settings
 from vertiwm_jax.env.tasks import Tasks, circle_tasks, random_tasks
 from vertiwm_jax.mechanics.vehicle import Vehicle
-from vertiwm_jax.terrain import files, vertibench, worlds
+from vertiwm_jax.terrain import files, worlds
 from vertiwm_jax.terrain.map import TerrainMap, stack
 from vertiwm_jax.terrain.worlds import MEDIAN_SLOPE_DEG, WorldConfig
 
@@ -55,13 +53,13 @@ def grounds(
 ) -> tuple[TerrainMap, TerrainMap]:
     """The worlds to train on and those held out, from maps at `path` or else procedural.
 
-    path, scale: see `load`. Too few maps to hold any out raise `ValueError`.
+    path, scale: see `files.load_map`. Too few maps to hold any out raise `ValueError`.
     """
     if path is None:
         keys = jax.random.split(jax.random.split(key)[0], config.train_worlds)
         training = worlds.generate(keys, config.training, scale)
         return training, suite_worlds(config, key, scale)
-    terrain = load(config, path, scale)
+    terrain = files.load_map(path, scale=scale, obstacles=config.obstacles)
     if terrain.worlds < config.held_out_every:
         raise ConfigError(
             f"{path}: held_out_every: expected at most the {terrain.worlds} worlds found, "
@@ -83,16 +81,6 @@ def suite_worlds(config: GroundConfig, key: jax.Array, scale: float = 1.0) -> Te
             keys = jax.random.split(jax.random.fold_in(test_key, number), config.suite_worlds)
             drawn.append(worlds.generate(keys, worlds_of, scale))
     return stack(drawn)
-
-
-def load(config: GroundConfig, path: Path, scale: float = 1.0) -> TerrainMap:
-    """The maps of a Verti-Bench checkout or of a folder of `.npz` maps; else `MapError`.
-
-    scale: of a small vehicle that is brought to full size, with the ground that it drives on.
-    """
-    terrain = vertibench.load(path) if (path / "envs").is_dir() else files.load(path)
-    terrain = froude.scaled(terrain, scale)
-    return terrain if config.obstacles else replace(terrain, obstacles=terrain.obstacles[:, :0])
 
 
 def training_tasks(

@@ -13,9 +13,8 @@ from vertiwm_jax import xla
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.geometry import wrap
-from vertiwm_jax.mechanics.kinematic import rest_on_ground
+from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.vehicle import Vehicle
-from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -169,7 +168,7 @@ def _draw(
         width = vehicle.width + 2 * config.clearance
 
         def is_acceptable(i: jax.Array) -> jax.Array:
-            roll, pitch, _ = place(selected, vehicle, start[i], yaw[i]).rpy
+            roll, pitch, _ = place(selected, start[i], yaw[i], vehicle=vehicle).rpy
             tilt = jnp.arccos(jnp.cos(roll) * jnp.cos(pitch))
             level = slope_around(selected, start[i]) <= config.roughest_start
             ends = jnp.stack([start[i], goal[i]])
@@ -185,14 +184,6 @@ def _draw(
     world = jnp.arange(count, dtype=jnp.int32) % terrain.worlds
     # In small batches, since each goes on until the last task of it is found.
     return jax.lax.map(draw, (jax.random.split(key, count), world), batch_size=_DRAWN_TOGETHER)
-
-
-def place(terrain: TerrainMap, vehicle: Vehicle, xy: jax.Array, yaw: jax.Array) -> VehicleState:
-    """A vehicle standing at `[2]` xy and `[]` yaw, laid on the ground under its four wheels."""
-    sizes = (vehicle.wheelbase, vehicle.track, vehicle.ride_height)
-    position, rpy = rest_on_ground(terrain, xy, yaw, *map(jnp.float32, sizes))
-    still = jnp.zeros(3)
-    return VehicleState(position, rpy, still, still)
 
 
 @jax.jit

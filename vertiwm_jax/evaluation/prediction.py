@@ -137,6 +137,38 @@ def evaluate(name: str, dynamics: Dynamics, params: Params, test: TestWindows) -
     return PredictionErrors(name, final, growth, count, int(lost.sum()))
 
 
+def prediction_errors(
+    dynamics: Dynamics,
+    params: Params,
+    drives: Drives,
+    terrain: TerrainMap,
+    *,
+    context: int = 16,
+    horizon: int = 16,
+    stride: int = 16,
+    name: str = "model",
+) -> PredictionErrors:
+    """Measures how far off a model's open-loop predictions of recorded drives are.
+
+    Args:
+        dynamics, params: the model, and its parameters.
+        drives, terrain: of `load_drives`.
+        context: recorded steps of 0.1 s that the model sees first.
+        horizon: steps that it then predicts from recorded commands alone.
+        stride: steps from one window to the next.
+        name: what the model is called.
+
+    Returns:
+        Mean absolute errors after the last step, with 95 % intervals, by measure (m and degrees)
+        and by kind of ground.
+
+    Raises:
+        DataError: no drive is long enough.
+    """
+    test = TestWindows.of(drives, terrain, context, horizon, stride)
+    return evaluate(name, dynamics, params, test)
+
+
 def format_table(rows: Sequence[PredictionErrors], measure: str, horizon: int) -> str:
     """A Markdown table of one measure, one model a row; the paper's figures where it has them."""
     kinds = list(rows[0].count)

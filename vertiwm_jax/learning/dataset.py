@@ -94,6 +94,27 @@ def load(folders: str | Path | Sequence[str | Path], split: Split) -> tuple[Driv
     return _join(paths, parts), stack(maps, [f"map of {path}" for path in paths])
 
 
+def load_drives(
+    folders: str | Path | Sequence[str | Path], split: Split = "train"
+) -> tuple[Drives, TerrainMap]:
+    """Loads recorded drives, and the maps that they were driven on.
+
+    Args:
+        folders: a folder of `.npz` files of drives, or several.
+        split: which drives of each file: `train`, `validation` or `test`.
+
+    Returns:
+        D drives at 10 Hz, of T steps at most: states `[D, T + 1, 12]` (position in m and roll,
+        pitch, yaw in rad in the frame of the world, velocity and angular velocity in that of the
+        body), commands `[D, T, 2]` (m/s, rad). And W worlds, of which `world` `[D]` is driven on.
+
+    Raises:
+        DataError: a file is malformed, or has too few drives for this split.
+        MapError: a map is missing, malformed, or differs from the others in extent or classes.
+    """
+    return load(folders, split)
+
+
 def load_file(path: Path) -> tuple[Drives, TerrainMap]:
     """All drives of one file, with its map; raises like `load`."""
     arrays, terrain = _read(path)

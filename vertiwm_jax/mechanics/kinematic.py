@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 from flax import struct
+from numpy.typing import ArrayLike
 
 from vertiwm_jax import geometry
-from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -118,3 +119,39 @@ def rest_on_ground(
     roll = jnp.arctan(bank * jnp.cos(pitch))
     height = 0.25 * (fl + fr + rl + rr) + ride_height * jnp.sqrt(1 + rise**2 + bank**2)
     return jnp.append(xy, height), jnp.stack([roll, pitch, yaw])
+
+
+def place(
+    terrain: TerrainMap,
+    xy: ArrayLike | None = None,
+    yaw: ArrayLike = 0.0,
+    *,
+    vehicle: Vehicle | None = None,
+    speed: ArrayLike = 0.0,
+) -> VehicleState:
+    """Places a vehicle on the ground under its four wheels.
+
+    Args:
+        terrain: the map, with the world selected.
+        xy: `[2]` m in the frame of the world; the middle of the map by default.
+        yaw: heading, rad from x (east) to y (north).
+        vehicle: which it is; the HMMWV by default.
+        speed: m/s, forward.
+
+    Returns:
+        Its state, leaves `[3]`. A model lets it settle by a few centimetres in its first steps.
+    """
+    sizes = hmmwv() if vehicle is None else vehicle
+    if xy is None:
+        rows, columns = terrain.elevation.shape[-2:]
+        half = jnp.array([columns - 1, 1 - rows]) / 2 * terrain.resolution
+        xy = terrain.origin + half
+    position, rpy = rest_on_ground(
+        terrain,
+        jnp.asarray(xy, jnp.float32),
+        jnp.asarray(yaw, jnp.float32),
+        jnp.float32(sizes.wheelbase),
+        jnp.float32(sizes.track),
+        jnp.float32(sizes.ride_height),
+    )
+    return VehicleState(position, rpy, jnp.array([speed, 0.0, 0.0]), jnp.zeros(3))

@@ -211,6 +211,21 @@ def load(name: str) -> VehicleConfig:
     return configuration.load(VehicleConfig, path)
 
 
+def load_vehicle(name: str = HMMWV) -> Vehicle:
+    """Loads a vehicle.
+
+    Args:
+        name: of one that comes along (`hmmwv`, `rover`, ...), or a YAML file of one.
+
+    Returns:
+        Its numbers at full size, in SI units, in the body frame: x forward, y left, z up.
+
+    Raises:
+        ConfigError: there is no such vehicle, or its file is malformed.
+    """
+    return load(name).vehicle
+
+
 @cache
 def hmmwv() -> Vehicle:
     """Chrono's HMMWV, which the model that comes with the package knows."""

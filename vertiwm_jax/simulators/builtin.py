@@ -6,8 +6,8 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax import geometry
-from vertiwm_jax.env import tasks
 from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.simulator import (
     GroundForces,
     Simulator,
@@ -58,7 +58,7 @@ class BuiltIn:
 
 @jax.jit
 def _place(params: SimulatorParams, terrain: TerrainMap, pose: jax.Array) -> _Moving:
-    state = tasks.place(terrain, params.vehicle, pose[:2], pose[2])
+    state = place(terrain, pose[:2], pose[2], vehicle=params.vehicle)
     history, none = DYNAMICS.init(params, terrain, state), jnp.zeros((4, 3))
     return _Moving(state, history, GroundForces(none, none[0]))
 

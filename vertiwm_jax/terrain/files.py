@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from vertiwm_jax.terrain import query, soil
+from vertiwm_jax import froude
+from vertiwm_jax.terrain import query, soil, vertibench
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.map import MapError, TerrainMap, build, stack
 from vertiwm_jax.terrain.soil import Soil
@@ -37,12 +38,34 @@ def load(path: str | Path) -> TerrainMap:
     preset of the same name. Raises `MapError` naming the file and the field.
     """
     path = Path(path)
+    if not path.exists():
+        raise MapError(str(path), "file", "an .npz map, or a folder of them", "no such file")
     if path.is_dir():
         files = sorted(path.glob("*.npz"))
         if not files:
             raise MapError(str(path), "folder", "one .npz map or more", "none")
         return stack([_load_world(file) for file in files], [str(file) for file in files])
     return _load_world(path)
+
+
+def load_map(path: str | Path, *, scale: float = 1.0, obstacles: bool = True) -> TerrainMap:
+    """Loads a map, or all maps of a folder.
+
+    Args:
+        path: an `.npz` map, a folder of them, or a checkout of Verti-Bench.
+        scale: of a small vehicle, as in its file; the ground becomes as large as it does.
+        obstacles: whether the rocks and trees of the maps stand there.
+
+    Returns:
+        W worlds, stacked in the order of their names, of which the first is selected.
+
+    Raises:
+        MapError: a file is missing or malformed; the message names it and the field.
+    """
+    path = Path(path)
+    terrain = vertibench.load(path) if (path / "envs").is_dir() else load(path)
+    terrain = froude.scaled(terrain, scale)
+    return terrain if obstacles else replace(terrain, obstacles=terrain.obstacles[:, :0])
 
 
 def save(terrain: TerrainMap, path: str | Path) -> None:

@@ -76,6 +76,49 @@ class TerrainMap:
         """Which of the sets of soils the selected world has."""
         return self.world if len(self.soils.n) > 1 else 0
 
+    @staticmethod
+    def from_array(
+        elevation: ArrayLike,
+        classes: ArrayLike | str = "grass",
+        *,
+        resolution: float = 1.0,
+        origin: tuple[float, float] | None = None,
+        friction: ArrayLike | None = None,
+        obstacles: ArrayLike | None = None,
+        name: str = "map",
+    ) -> "TerrainMap":
+        """Makes a checked map of one world from arrays.
+
+        Args:
+            elevation: `[R, C]` heights of vertices, m; row 0 is the northernmost, column 0 the
+                westernmost.
+            classes: the name of a class of ground (`terrain.classes.STANDARD`), or `[r, c]` ids
+                of cells over the same extent.
+            resolution: m between vertices.
+            origin: x, y of vertex (0, 0), m; the map is centred by default.
+            friction: `[r, c]` coefficients; the mean of each class by default, ignored on soil.
+            obstacles: `[N, 5]` centre x, y, size x, size y and height, m; none by default.
+            name: what errors call the map.
+
+        Raises:
+            MapError: an array is malformed; the message names it.
+        """
+        if isinstance(classes, str):
+            if classes not in STANDARD.names:
+                expected = f"one of {', '.join(STANDARD.names)}"
+                raise MapError(name, "classes", expected, repr(classes))
+            cells = (1, 1) if friction is None else np.shape(friction)
+            classes = np.full(cells, STANDARD.names.index(classes))
+        return build(
+            elevation,
+            classes,
+            friction,
+            obstacles,
+            resolution=resolution,
+            origin=origin,
+            name=name,
+        )
+
     def select(self, world: jax.Array) -> Self:
         """The map with world `[]` selected. Under `vmap` only the index is batched: no copy."""
         return replace(self, world=jnp.asarray(world, jnp.int32))

@@ -150,6 +150,23 @@ def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> Terrai
     )
 
 
+def make_worlds(
+    number: int = 1, seed: int = 0, config: WorldConfig = WorldConfig(), *, scale: float = 1.0
+) -> TerrainMap:
+    """Draws procedural worlds of 128 m x 128 m.
+
+    Args:
+        number: how many.
+        seed: decides what they look like.
+        config: their ground, slopes and obstacles, in turns.
+        scale: of a small vehicle that is brought to full size, as in its file.
+
+    Returns:
+        A map of W = `number` worlds, of which the first is selected.
+    """
+    return generate(jax.random.split(jax.random.key(seed), number), config, scale)
+
+
 @functools.partial(xla.brief_jit, static_argnames="relief")
 def _ground(
     key: jax.Array, slope_deg: jax.Array, kind: jax.Array, relief: ReliefConfig

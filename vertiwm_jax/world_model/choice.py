@@ -54,6 +54,39 @@ def choose(
     return found[name]
 
 
+def load_model(
+    name: Imagined = "vertiwm",
+    weights: str | Path | None = None,
+    *,
+    vehicle: Vehicle | None = None,
+    soil: SoilSource | None = None,
+    compute_dtype: Operands = "float32",
+    embeddings: bool = False,
+) -> tuple[Dynamics, Params]:
+    """Loads a model of how a vehicle moves.
+
+    Args:
+        name: `vertiwm`; its specialists alone, `transformer` and `nesam`; `builtin`, the
+            simulator; or `bicycle`, which knows no forces.
+        weights: folder of a fitted model; the one that comes along by default.
+        vehicle: what simulator and bicycle drive, the HMMWV by default; learned models move the
+            one that they were fitted to.
+        soil: where NeSAM has soils from, `map` or `predicted`; by default as it was fitted.
+        compute_dtype: what learned models multiply.
+        embeddings: whether the history holds the ground as encoders see it.
+
+    Returns:
+        The model, and its parameters.
+
+    Raises:
+        CheckpointError: there is no such model in the folder, or it cannot be read.
+    """
+    folder = Path(weights) if weights else None
+    model, params = choose(name, folder, soil, vehicle)
+    params = rounded(params, compute_dtype)
+    return sighted(name, model, params, folder) if embeddings else (model, params)
+
+
 def sighted(
     name: Imagined, dynamics: Dynamics, params: Params, weights: Path | None = None
 ) -> tuple[Dynamics, Params]:
