@@ -1,1 +1,1 @@
-"""Learning while driving: a model's weights stay, what it is told of the ground does not."""
+"""Adaptation while driving: soils are estimated, and a model's weights stay as they are."""

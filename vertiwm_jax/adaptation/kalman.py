@@ -1,4 +1,4 @@
-"""One measurement of an iterated extended Kalman filter, which ignores what cannot be."""
+"""One update of an iterated extended Kalman filter, which ignores implausible measurements."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from flax import struct
 
 @struct.dataclass
 class Gaussian:
-    """What is believed of N numbers.
+    """A Gaussian belief about N numbers.
 
     mean: `[..., N]`. covariance: `[..., N, N]`.
     """
@@ -25,15 +25,15 @@ def correct(
     iterations: int = 1,
     longest: float = jnp.inf,
 ) -> tuple[Gaussian, jax.Array]:
-    """The belief after a measurement of M numbers, and `[]` bool, whether it was plausible.
+    """The belief after a measurement of M numbers, and whether it was plausible, `[]` bool.
 
-    residual: from `[N]` to `[M]`, what was measured less what these predict, in standard
-        deviations of the measurement. The mean takes as many Gauss-Newton steps as there are
-        iterations (Bell and Cathey, 1993); the covariance is linearised where they end.
-    gate: the largest squared Mahalanobis distance of a plausible residual: what the posterior
-        mean still misses and how far it went, both in standard deviations. Of a measurement
-        beyond it, or of one that is not finite, nothing is learned.
-    longest: a step in any of the N numbers.
+    residual: function of the `[N]` numbers, `[M]` measurement minus prediction, in standard
+        deviations of the measurement. The mean takes `iterations` Gauss-Newton steps (Bell and
+        Cathey, 1993), and the covariance is linearized at their end.
+    gate: the largest squared Mahalanobis distance of a plausible measurement: that of the
+        remaining residual plus that of the step of the mean. A measurement beyond it, or one
+        that is not finite, changes nothing.
+    longest: largest step in any of the N numbers.
 
     Joseph's form keeps the covariance symmetric and positive in float32.
     """

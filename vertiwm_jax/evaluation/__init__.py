@@ -1,1 +1,1 @@
-"""How good a model or a policy is: prediction errors, navigation results, plots."""
+"""Tests of models and policies: prediction errors, navigation results, plots."""

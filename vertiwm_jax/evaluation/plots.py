@@ -1,4 +1,4 @@
-"""Pictures of drives and of learning, in one style that survives print and colour blindness."""
+"""Plots of drives and of learning curves, readable in print and by color-blind readers."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def learning_curves(
     """One panel for each of `labels`, metric name to axis label, one line for each run.
 
     metrics: by run, columns of numbers of equal length by metric name. `x` names the column of
-    the horizontal axis. Gaps (NaN) are left open; a run may lack metrics.
+    the horizontal axis. NaN leaves a gap; a run may lack metrics.
     """
     with style():
         columns = math.ceil(math.sqrt(len(labels)))
@@ -109,7 +109,7 @@ def learning_curves(
 
 
 def save(figure: Figure, path: str | Path) -> None:
-    """Write a figure as a whole or not at all, in the format of the ending; else `RunError`."""
+    """Writes a figure in the format of its ending, as a whole or not at all; raises `RunError`."""
     image = io.BytesIO()
     with style():
         figure.savefig(image, format=Path(path).suffix[1:])
@@ -117,7 +117,7 @@ def save(figure: Figure, path: str | Path) -> None:
 
 
 def line(i: int) -> tuple[str, str]:
-    """Colour and dash of the i-th line of a picture."""
+    """Color and dash of the i-th line of a plot."""
     return _COLOURS[i % len(_COLOURS)], _DASHES[i % len(_DASHES)]
 
 
@@ -136,14 +136,14 @@ def _circle(centre: np.ndarray, radius: float):
 
 # Imported when the first picture is drawn: training should not wait for matplotlib.
 def style():
-    """A context in which a picture is drawn."""
+    """A context with the style of all plots."""
     import matplotlib
 
     return matplotlib.rc_context(_STYLE)
 
 
 def sheet(width: float, height: float) -> Figure:
-    """An empty figure of that many inches."""
+    """An empty figure of this size in inches."""
     from matplotlib.figure import Figure
 
     # Not made by pyplot: belongs to no window and is freed with its last reference.

@@ -1,4 +1,4 @@
-"""What the paper reports, on drives and worlds of its own."""
+"""The figures of the paper, which are from its own drives and worlds."""
 
 POSITION_ERRORS: dict[str, dict[str, float]] = {
     "protocol: vertiwm": {"rigid": 0.3655, "deformable": 0.6409, "transition": 0.5773},
@@ -11,8 +11,8 @@ POSITION_ERRORS: dict[str, dict[str, float]] = {
     "everything: transformer": {"rigid": 0.3413, "deformable": 0.6964, "transition": 0.6518},
     "no_terrain: transformer": {"rigid": 0.4674, "deformable": 0.7905, "transition": 0.7522},
 }
-"""Tables I and II, 16-step position errors, m, by the rows of `configs/rows`: a configuration's
-name, and which of its models. A specialist that has seen one kind of ground is reported on that.
+"""Tables I and II: 16-step position errors, m, by row of `configs/rows` (a configuration's name and
+one of its models). A specialist of one kind of ground is reported on that ground alone.
 """
 
 DRIVING: dict[str, str] = {
@@ -22,4 +22,4 @@ DRIVING: dict[str, str] = {
     "td3 in vertiwm": "18/20, 32.2 s, trained for 1.35 h",
     "sac in vertiwm": "18/20, 31.3 s, trained for 1.55 h",
 }
-"""Table III, by how a policy is trained."""
+"""Table III, by the algorithm and model of a policy's training."""

@@ -1,1 +1,1 @@
-"""Recorded drives: reading them, cutting them into windows, fitting models to them."""
+"""Reads recorded drives, cuts them into windows, and fits models to them."""

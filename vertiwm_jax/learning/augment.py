@@ -1,11 +1,11 @@
-"""Mirrored drives on mirrored ground: twice the data, left and right learned alike.
+"""Mirrors drives together with their ground: twice the data, with left and right alike.
 
 The world is mirrored across the diagonal from bottom left to top right, which exchanges x and y
-about the centre of the map. Across an axis of the map the ground would not stay the same: rigid
-cells are two triangles split along that diagonal, and would be split along the other. For a model
-it is a left-right mirror all the same, as models must not depend on where a vehicle stands or
-which way it faces. That is also why drives are not moved, turned or lifted: a model that is
-invariant by construction learns nothing from it.
+about the center of the map. A mirror across an axis of the map would change the ground: rigid cells
+are two triangles split along that diagonal, and would be split along the other. To a model this is
+a left-right mirror, because models do not depend on position and heading. For the same reason
+drives are not moved, turned or lifted: a model that is invariant by construction would learn
+nothing from that.
 """
 
 from dataclasses import replace
@@ -24,9 +24,9 @@ _EXCHANGED = np.array([1, 0, 2])
 
 
 def with_mirrored(terrain: TerrainMap) -> TerrainMap:
-    """The W worlds and behind them, as worlds W to 2 W - 1, their mirror images.
+    """The W worlds followed by their mirror images, worlds W to 2 W - 1.
 
-    `MapError` unless the maps are square, cells and all.
+    `MapError` unless maps and their class cells are square.
     """
     for field in ("elevation", "semantic"):
         rows, columns = getattr(terrain, field).shape[1:]
@@ -68,7 +68,7 @@ def mirror(windows: Windows, terrain: TerrainMap) -> Windows:
 
 
 def mirror_some(key: jax.Array, windows: Windows, terrain: TerrainMap) -> Windows:
-    """`mirror` of each window with probability 1/2."""
+    """Mirrors each window with probability 1/2."""
     chosen = jax.random.bernoulli(key, shape=windows.world.shape)
 
     def choose(image: jax.Array, original: jax.Array) -> jax.Array:
@@ -78,7 +78,7 @@ def mirror_some(key: jax.Array, windows: Windows, terrain: TerrainMap) -> Window
 
 
 def _across(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
-    """Points `[..., 2]` with x and y exchanged about the centre of the map."""
+    """Points `[..., 2]` with x and y exchanged about the center of the map."""
     half = 0.5 * (terrain.elevation.shape[1] - 1) * terrain.resolution
     centre = terrain.origin + half * jnp.array([1.0, -1.0])
     return centre + (xy - centre)[..., ::-1]

@@ -1,8 +1,8 @@
-"""`python -m vertiwm_jax.learning.compact`: drives in a tenth of the space, as training reads them.
+"""`python -m vertiwm_jax.learning.compact`: stores drives in a tenth of the space.
 
-A compact file is a file of the schema: single precision, rounded to a fixed step that is a power
-of two, so that most of its bits are zero and the archive squeezes them out. What the schema does
-not name is left out, and values after the end of a drive repeat the last valid ones.
+A compact file is a file of the schema. Its numbers are float32, rounded to a fixed step that is a
+power of two, so that most bits are zero and compress well. Arrays that the schema does not name are
+left out, and values after the end of a drive repeat the last valid ones.
 """
 
 import io
@@ -33,7 +33,7 @@ STEPS: dict[str, np.ndarray] = {
     "chassis_force": np.array(2.0**5),  # N
     "steer_angle": np.array(2.0**-12),  # rad
 }
-"""To what each array is rounded; the error is at most half of it."""
+"""Step to which each array is rounded; the error is at most half of it."""
 ELEVATION_STEP = 2.0**-12
 """The same for heights of maps, m."""
 
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def write(source: Path, destination: Path) -> dict[str, int]:
-    """Compacts every collection in `source`; bytes written, by folder.
+    """Compacts every collection in `source`, and gives the bytes written by folder.
 
     The same drives give the same bytes. Raises `DataError` or `MapError` on anything malformed,
     `RunError` on what cannot be written.
@@ -94,14 +94,14 @@ def write(source: Path, destination: Path) -> dict[str, int]:
 
 
 def _target(path: Path, source: Path, destination: Path) -> Path:
-    """Where a file of `source` goes; its folder is made."""
+    """The path to write a file of `source` to; makes its folder."""
     target = destination / path.relative_to(source)
     target.parent.mkdir(parents=True, exist_ok=True)
     return target
 
 
 def _archive(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> bytes:
-    """An `.npz` archive; LZMA makes of rounded numbers three quarters of what deflate does."""
+    """An `.npz` archive by LZMA, which is a quarter smaller than deflate for rounded numbers."""
     stored = {name: _rounded(name, array, arrays["length"]) for name, array in arrays.items()}
     stored["meta"] = np.array(json.dumps(meta))
     buffer = io.BytesIO()

@@ -1,4 +1,4 @@
-"""What a prediction is fitted by: the trajectory loss of the paper, and a one-step loss."""
+"""Losses of predictions: the paper's trajectory loss, and a one-step loss."""
 
 import jax
 import jax.numpy as jnp
@@ -61,9 +61,9 @@ def step_loss(
 ) -> jax.Array:
     """Mean squared error `[...]` of one step from `state`, leaves `[..., 3]`.
 
-    Compared are the twelve components of `motion.transition`, the increment and the changes of
-    velocity in the body frame, in units of their `[12]` deviation over drives; it matters neither
-    where the vehicle stands nor which way it faces.
+    It compares the twelve components of `motion.transition` (the pose increment and the changes of
+    velocity in the body frame), each divided by its `[12]` standard deviation over drives. So it
+    depends neither on position nor on heading.
     """
     error = motion.transition(state, predicted) - motion.transition(state, recorded)
     return jnp.mean((error / deviation) ** 2, axis=-1)

@@ -1,4 +1,4 @@
-"""Stages of a longer fit: each in a folder of its own, and done once for the same inputs."""
+"""Stages of a fit. Each has a folder, and is run once for the same inputs."""
 
 import hashlib
 import logging
@@ -20,15 +20,15 @@ from vertiwm_jax.training import CheckpointConfig
 
 _log = logging.getLogger(__name__)
 INPUTS = "inputs.txt"
-"""File in the folder of a stage that tells all that its result depends on."""
+"""File in the folder of a stage that lists its inputs."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """All that the result of a stage depends on, besides the program and the machine.
+    """Everything that the result of a stage depends on, except program and machine.
 
-    learns_from: kinds of drives; drives: all files of drives, of which the constants of a model
-        are measured, with their sizes. before: `digest` of the stages that it builds on.
+    learns_from: kinds of drives; drives: all files of drives with their sizes, since the constants
+        of a model are measured on them. before: `digest` of the stages that it builds on.
     """
 
     problem: Problem
@@ -49,7 +49,7 @@ class Inputs:
 
 
 def digest(params: Params) -> str:
-    """What parameters are known by."""
+    """A digest of parameters."""
     sum_ = hashlib.sha256()
     for path, leaf in jax.tree.leaves_with_path(params):
         sum_.update(f"{jax.tree_util.keystr(path)} {leaf.shape} {leaf.dtype}".encode())
@@ -66,11 +66,11 @@ def fit(
     key: jax.Array,
     reuse: Sequence[Path],
 ) -> Any:
-    """What `fitting.fit` gives, in the folder `name` of the run.
+    """Runs `fitting.fit` in the folder `name` of the run.
 
-    One that has ended with the same inputs is not repeated, whether there or in the folder of one
-    of the runs in `reuse`; one that has begun with them goes on from its newest checkpoint; one
-    with other inputs is thrown away. One of no updates is left out.
+    A stage that has ended with the same inputs, there or in a run of `reuse`, is not repeated. A
+    stage that has begun with them goes on from its newest checkpoint. A stage with other inputs is
+    deleted and begins again. A stage of 0 updates is left out.
     """
     if not inputs.config.updates:
         return params

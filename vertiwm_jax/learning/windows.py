@@ -1,4 +1,4 @@
-"""Prediction windows: where they lie in the drives, and what they hold."""
+"""Prediction windows: their places in drives, and their contents."""
 
 from functools import partial
 
@@ -17,7 +17,7 @@ GROUNDS = ("rigid", "deformable", "transition")
 
 @struct.dataclass
 class WindowIndex:
-    """Where N windows of C context steps and K predicted ones lie in the drives.
+    """Places in drives of N windows with C context steps and K steps to predict.
 
     drive: `[N]`; start: `[N]` first step of the context; ground: `[N]` index into `GROUNDS`, over
     the predicted steps; context: C, static; horizon: K, static.
@@ -32,11 +32,11 @@ class WindowIndex:
 
 @struct.dataclass
 class Windows:
-    """N windows of C context steps and K predicted ones.
+    """N windows with C context steps and K steps to predict.
 
     state: `[N, C + K + 1, 12]`; control: `[N, C + K, 2]`; world: `[N]`;
     ground: `[N]` index into `GROUNDS`, over the predicted steps; context: C, static;
-    auxiliary: leaves `[N, C + K + 1, ...]`, those that the drives have.
+    auxiliary: leaves `[N, C + K + 1, ...]`, as far as the drives have them.
     """
 
     state: jax.Array
@@ -81,7 +81,7 @@ def index(
 
 @jax.jit
 def gather(drives: Drives, index: WindowIndex) -> Windows:
-    """The windows at `index`, all or a batch of them; copies only those.
+    """Gathers the windows at `index`, which may be a batch of all; copies only those.
 
     Pass drives that lie on the device (`jax.device_put`) when this is called more than once. A
     batch is `jax.tree.map(lambda x: x[rows], index)`.

@@ -1,1 +1,1 @@
-"""Physics, nothing learned: wheels on soil and rock, vehicles, and the built-in simulator."""
+"""Physics without learned parts: wheels on soil and rock, vehicles, and the simulator."""

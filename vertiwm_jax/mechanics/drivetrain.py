@@ -1,4 +1,4 @@
-"""What a command does to the wheels: steering, driving torque, brakes."""
+"""Turns a command into steering angles, torques and brakes of the wheels."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ SPIN_FLOOR = 0.5
 
 
 class Actuation(NamedTuple):
-    """What wheels are told to do.
+    """Inputs of the wheels.
 
     steering: `[]` rad of the front wheels, as far as they have turned. angle: `[4]` rad of each.
     torque: N m on each wheel, `[]` or `[4]`.
@@ -34,7 +34,7 @@ def actuate(
     wheel_speed: jax.Array,
     seconds: float,
 ) -> Actuation:
-    """What a command is to the wheels in a sub-step; physics reads commands here alone.
+    """The inputs of the wheels for a command in a sub-step. Physics reads commands only here.
 
     Speed is controlled by a pedal in proportion to its error. Differentials are open: all wheels
     get the same torque, limited by power at their mean speed; the engine fades out over the upper

@@ -30,12 +30,12 @@ class Wheel:
 
 @struct.dataclass
 class WheelForces:
-    """What the ground does to a wheel `[...]`, in the wheel's frame: x ahead, y left, z up.
+    """Forces of the ground on a wheel `[...]`, in the wheel's frame: x ahead, y left, z up.
 
     longitudinal: N; on soil the drawbar pull, compaction resistance included.
     lateral: N; opposes the lateral velocity.
     normal: N.
-    torque: N m about the axle that the ground resists with: positive brakes positive spin.
+    torque: N m of the ground about the axle; positive brakes positive spin.
     """
 
     longitudinal: jax.Array
@@ -45,7 +45,7 @@ class WheelForces:
 
 
 class SoilContact(Protocol):
-    """Parameters of contact with soil, which say what soil does to a wheel."""
+    """Parameters of a contact with soil, whose method gives its forces on a wheel."""
 
     def forces(
         self,

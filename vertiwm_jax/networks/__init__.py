@@ -1,1 +1,1 @@
-"""Learned pieces, nothing composed."""
+"""Neural networks, each by itself; `world_model` composes them."""

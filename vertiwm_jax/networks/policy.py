@@ -49,7 +49,7 @@ class Squashed:
 
     @property
     def mean(self) -> jax.Array:
-        """`[..., A]` the action in the middle, which is the median."""
+        """`[..., A]` the tanh of the mean, which is the median action."""
         return jnp.tanh(self.gaussian.mean)
 
     def sample(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -82,10 +82,10 @@ class MLP(nn.Module):
 
 @dataclass(frozen=True)
 class Candidates:
-    """C actions to choose between, of each of which an observation tells the same things.
+    """C candidate actions; an observation has the same features of each.
 
-    split: `[..., O]` observations to what is seen of each candidate, `[..., C, F]`, and to all
-        the rest, `[..., R]`.
+    split: splits observations `[..., O]` into the features of each candidate `[..., C, F]` and
+        the rest `[..., R]`.
     actions: the C actions, each of A numbers in [-1, 1].
     """
 
@@ -95,11 +95,11 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Senses:
-    """How networks read an observation; as it is, by default.
+    """How networks read an observation; by default as a plain vector.
 
-    candidates: actions that they weigh against each other.
-    image: shape `(h, w, c)` of a picture that its last h w c numbers are the `tiles` of, which each
-        network learns to compress to 16 numbers; h and w are multiples of 4.
+    candidates: actions between which networks choose by attention.
+    image: shape `(h, w, c)` of an image, of which the last h w c numbers are the `tiles`. Each
+        network learns to compress it to 16 numbers. h and w are multiples of 4.
     """
 
     candidates: Candidates | None = None
@@ -107,14 +107,15 @@ class Senses:
 
     @property
     def parts(self) -> tuple[slice, ...]:
-        """What of an observation is read by itself: all of it, or the picture and what precedes."""
+        """The parts of an observation that are read separately: all of it, or the image and the
+        rest."""
         if self.image is None:
             return (slice(None),)
         start = -math.prod(self.image)
         return slice(start), slice(start, None)
 
     def read(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The observation `[..., O]` without its picture, and that compressed, `[..., 16]` or none.
+        """The observation `[..., O]` without its image, and the compressed image, if any.
 
         Part of a module's compact method.
         """
@@ -127,17 +128,17 @@ class Senses:
 
 
 def tiles(picture: jax.Array) -> jax.Array:
-    """`[..., h, w, c]` to its tiles of 4 x 4, `[..., h w / 16, 16 c]`, from the first row on."""
+    """Cuts `[..., h, w, c]` into tiles of 4 x 4, `[..., h w / 16, 16 c]`, row by row."""
     *batch, h, w, c = picture.shape
     split = picture.reshape(*batch, h // _TILE, _TILE, w // _TILE, _TILE, c)
     return jnp.swapaxes(split, -4, -3).reshape(*batch, -1, _TILE**2 * c)
 
 
 class Compressor(nn.Module):
-    """The tiles of a picture of the ground to 16 numbers: each to 16, then all together.
+    """Compresses the tiles of an image to 16 numbers: first each tile, then all together.
 
-    Matmuls of tiles and no convolutions, whose gradients take most of an iteration on a CPU; the
-    features of the picture have seen their neighbourhood already.
+    It uses matmuls of tiles instead of convolutions, whose gradients would take most of an
+    iteration on a CPU. The features of the image already depend on their neighborhood.
     """
 
     @nn.compact
@@ -151,7 +152,7 @@ class Compressor(nn.Module):
 class Attention(nn.Module):
     """Looks at every candidate with the same weights and attends to some.
 
-    What is learned of one candidate so holds for all, which takes a fraction of the experience.
+    What is learned on one candidate holds for all, which needs much less experience.
     """
 
     hidden: Sequence[int]
@@ -163,7 +164,7 @@ class Attention(nn.Module):
     ) -> tuple[jax.Array, jax.Array]:
         """`[..., O]` to features `[..., 2 H + R]` and the mean `[..., A]` of attended actions.
 
-        compressed: what else is told, of which all the rest `R` then has more.
+        compressed: the compressed image, which is appended to the rest.
         """
         seen, rest = self.candidates.split(observation)
         rest = jnp.concatenate([rest, compressed], axis=-1)
@@ -219,9 +220,8 @@ class Critic(nn.Module):
 class SquashedActor(nn.Module):
     """`[..., O]` observations to `Squashed` Gaussians over actions, whose width is learned too.
 
-    For algorithms that learn from what earlier policies did. With candidates the mean corrects
-    the mean of those attended to, before the tanh. Without an initial log standard deviation the
-    policy is certain: its Gaussians have no width.
+    For off-policy algorithms. With candidates the mean corrects the mean of those attended to,
+    before the tanh. Without an initial log standard deviation the policy is deterministic.
     """
 
     actions: int
@@ -259,7 +259,7 @@ class ActionCritic(nn.Module):
 def twin_values(
     critic: ActionCritic, params: Any, observation: jax.Array, action: jax.Array
 ) -> jax.Array:
-    """`[2, ...]` values of actions, by two critics whose weights have an axis for them."""
+    """`[2, ...]` values of actions, by two critics whose weights are stacked."""
     values = jax.vmap(critic.apply, (0, None, None))(params, observation, action)
     return cast(jax.Array, values)
 
@@ -267,8 +267,8 @@ def twin_values(
 def _largest(x: jax.Array) -> jax.Array:
     """`[..., C, F]` to `[..., F]`, the largest of the C.
 
-    The derivative of `jnp.max` looks for what equals the maximum. Compilers may compute x once more
-    for it, with other rounding; then nothing does, and it is NaN.
+    The derivative of `jnp.max` looks for entries that equal the maximum. A compiler may compute x
+    again for it, with other rounding. Then no entry is equal, and the derivative is NaN.
     """
     chosen = jnp.argmax(x, axis=-2, keepdims=True) == jnp.arange(x.shape[-2])[:, None]
     return jnp.sum(jnp.where(chosen, x, 0.0), axis=-2)
@@ -277,7 +277,7 @@ def _largest(x: jax.Array) -> jax.Array:
 def _look(
     observation: jax.Array, hidden: Sequence[int], senses: Senses
 ) -> tuple[jax.Array, jax.Array | float, Sequence[int]]:
-    """Features `[..., F]`, the mean of attended actions, 0 without any, and layers still to come.
+    """Features `[..., F]`, the mean of attended actions (0 if there are none), and the layers left.
 
     Part of a module's compact method.
     """

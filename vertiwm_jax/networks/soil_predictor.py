@@ -1,4 +1,4 @@
-"""Soil parameters from what the ground looks like (Sec. IV-B)."""
+"""Predicts soil parameters from the semantic latent (Sec. IV-B)."""
 
 import math
 
@@ -28,8 +28,9 @@ _LOGARITHMIC = ("kc", "kphi", "cohesion", "shear_modulus")
 class SoilPredictor(nn.Module):
     """The six parameters of Bekker, Mohr-Coulomb and Janosi-Hanamoto, within `BOUNDS`.
 
-    28,262 parameters. The convolutions have stride 2: the counts of the paper at a tenth of the
-    cost, 1.3 MFLOP, and the mean over space that follows keeps no detail in any case.
+    28,262 parameters. The convolutions have stride 2. That keeps the paper's number of parameters
+    at a tenth of the cost (1.3 MFLOP), and the mean over space that follows would drop details
+    anyway.
     """
 
     @nn.compact

@@ -1,1 +1,1 @@
-"""Sources of truth outside jit: one vehicle, one world, 0.1 s at a time; recording, and tasks."""
+"""Simulators outside jit, which move one vehicle at a time; recording of drives, and tasks."""

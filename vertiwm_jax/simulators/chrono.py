@@ -1,4 +1,4 @@
-"""Project Chrono as a source of drives: its HMMWV, headless, on rigid, soft and mixed ground.
+"""Drives Project Chrono's HMMWV, headless, on rigid, soft and mixed ground.
 
 Written for PyChrono 9.0, and like the program that recorded `data/open` with 9.0.1: rigid tyres,
 locked differentials, SCM soil near the wheels alone, 5 ms steps.
@@ -59,7 +59,7 @@ def modules() -> tuple[Any, Any]:
 class Chrono:
     """An HMMWV on the selected world of a map, whose obstacles are solid boxes.
 
-    Commands of backward driving make it brake.
+    Negative speeds make it brake.
     """
 
     def __init__(self, terrain: TerrainMap) -> None:
@@ -186,7 +186,7 @@ class _Drive:
                 probe.SetPos(self._chrono.ChVector3d(pos.x, pos.y, -1000.0))
 
     def advance(self, speed: float, steering: float, brake: bool = False) -> None:
-        """Holds m/s and a share of full lock for 0.1 s."""
+        """Holds a speed, m/s, and a share of full lock for 0.1 s."""
         inputs, total = self._inputs, np.zeros((5, 3))
         for _ in range(SUBSTEPS):
             now = self._system.GetChTime()
@@ -214,7 +214,7 @@ class _Drive:
         return forces
 
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Auxiliary]:
-        """What `_observed` takes, and what is known of the wheels but their sinkage."""
+        """The arguments of `_observed`, and the state of the wheels except their sinkage."""
         frame, spindles = self._car.GetRefFrame(), self._spindles
         q = frame.GetRot()
         pose = np.array([*_numbers(frame.GetPos()), q.e0, q.e1, q.e2, q.e3], np.float32)

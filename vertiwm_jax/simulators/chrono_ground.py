@@ -1,4 +1,4 @@
-"""One world of a map as Project Chrono builds ground: rigid height maps, SCM soil, boxes.
+"""Builds one world of a map in Project Chrono: rigid height maps, SCM soil, boxes.
 
 Chrono's origin is the middle of the map.
 """
@@ -20,17 +20,17 @@ RESTITUTION = 0.01
 CELL = 0.1
 """m between the nodes of SCM's soil."""
 ELASTICITY = {"mud": 2e8, "sand": 4e8, "snow": 4e7}
-"""Pa/m by which Verti-Bench's soils unload."""
+"""Stiffness, Pa/m, with which Verti-Bench's soils unload."""
 STIFFENING = 100.0
-"""The same of other soils, in multiples of their kphi; mud's."""
+"""The same for other soils, as a multiple of their kphi; that of mud."""
 DAMPING = 3e4
-"""Pa s/m of all soils, normal to the ground."""
+"""Damping of all soils normal to the ground, Pa s/m."""
 NO_SOIL = (0.0, 0.0, 1.0, 0.0, 0.0, 0.01, 1e-6, 0.0)
-"""What SCM is told where the ground is rigid: a soil that pushes back with nothing."""
+"""SCM's parameters where the ground is rigid: a soil without force."""
 BULLDOZING = (55.0, 1.0, 5, 10)
 """Erosion angle in degrees, flow factor, iterations, propagations."""
 GROUND_FAMILY = 14
-"""Of collision models, that of `RigidTerrain`: what is of it does not touch the rest of it."""
+"""Family of collision models of `RigidTerrain`, whose members do not touch each other."""
 _GRAY = 65535
 
 
@@ -140,7 +140,7 @@ class Ground:
         return path
 
     def _soil(self, kind: int) -> tuple[float, ...]:
-        """What SCM wants to know of a ground class."""
+        """The parameters of SCM for a ground class."""
         name = self._terrain.class_names[kind]
         if not self._terrain.deformable[kind]:
             return NO_SOIL

@@ -1,4 +1,4 @@
-"""Navigation in a simulator outside jit, for code that expects Gymnasium."""
+"""The navigation task in a simulator outside jit, as a Gymnasium environment."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,9 +21,9 @@ from vertiwm_jax.terrain.map import TerrainMap
 class SimulatorEnv(NavigationGymEnv):
     """One vehicle in a simulator; observation, reward and endings are those of `NavigationEnv`.
 
-    simulator: as `Chrono` or `BuiltIn`, called in every reset with the world of the task selected.
+    simulator: such as `Chrono` or `BuiltIn`; every reset calls it with the world of its task.
     tasks: the pool that resets draw from; `ValueError` names the first that cannot be driven.
-    config: but `settle_steps`, since simulators let the vehicle settle themselves.
+    config: `settle_steps` is not used, because simulators let the vehicle settle.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Simulations side by side: each process of its own moves one vehicle at a time."""
+"""Runs simulations in several processes, each of which moves one vehicle at a time."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -11,12 +11,12 @@ from typing import Any
 from vertiwm_jax.simulators.protocol import SimulatorError
 
 Map = Callable[..., Iterator[Any]]
-"""`map`, or what does the same in several processes: functions and values must pickle."""
+"""`map`, or the same in several processes; functions and values must pickle."""
 
 
 @contextmanager
 def simulating(jobs: int) -> Iterator[Map]:
-    """`map`, in this process or in several; `SimulatorError` where one of those is killed."""
+    """`map`, in this process or in several; raises `SimulatorError` if one of them is killed."""
     if jobs == 1:
         yield map
         return

@@ -1,4 +1,4 @@
-"""What every simulator outside jit can do, and what it shows of its vehicle."""
+"""The interface of simulators outside jit."""
 
 from typing import Protocol
 
@@ -13,22 +13,22 @@ from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 
 SETTLE_SECONDS = 1.5
-"""How long a vehicle stands still before a start is handed out, s."""
+"""Time for which a vehicle stands still before it starts, s."""
 _TYRE = 0.2
-"""Half of the length, m, over which the ground under a tyre is taken for a plane."""
+"""Half of the length, m, over which the ground under a tire is taken as a plane."""
 
 
 class SimulatorError(UserError):
-    """A simulator that cannot be run; the message says what it takes."""
+    """A simulator cannot be run; the message says what it needs."""
 
 
 @struct.dataclass
 class Observation:
-    """One vehicle at one moment, in NumPy arrays.
+    """The observed state of one vehicle, in NumPy arrays.
 
     state: `[12]` as `VehicleState.vector`, of the body origin between the wheel centres.
     wheel_class: `[4]` uint8, ground class under each wheel.
-    auxiliary: what the simulator knows of the wheels; forces are means over the last step.
+    auxiliary: state of the wheels, where known; forces are means over the last step.
     """
 
     state: Array
@@ -37,14 +37,14 @@ class Observation:
 
 
 class Simulator(Protocol):
-    """Drives one vehicle on one world, 0.1 s at a time."""
+    """Drives one vehicle on one world in steps of 0.1 s."""
 
     def start(self, x: float, y: float, yaw: float) -> Observation:
-        """A vehicle at rest on its wheels at x, y, m, that looks along yaw, rad."""
+        """Places a vehicle at rest at x, y, m, with heading yaw, rad."""
         ...
 
     def step(self, command: np.ndarray) -> Observation:
-        """The vehicle 0.1 s later. command: `[2]` speed, m/s, and front-wheel angle, rad."""
+        """Drives for 0.1 s. command: `[2]` speed, m/s, and front-wheel angle, rad."""
         ...
 
 
