@@ -1,7 +1,6 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from vertiwm_jax.evaluation import error_sources, prediction
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.learning.windows import Windows, gather, index
+from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
@@ -76,7 +75,8 @@ def test_a_perfect_model_has_no_error():
     windows = straight(1)
     state = jnp.asarray(rng.normal(size=windows.state.shape), jnp.float32)
     windows = windows.replace(state=state)
-    predicted = prediction.predict(Recording(), state[0], GROUND, windows)
+    test = TestWindows(windows, np.zeros(1, int), GROUND)
+    predicted = prediction.predict(Recording(), state[0], test).states
     np.testing.assert_array_equal(predicted.vector[0], state[0, CONTEXT + 1 :])
     errors = errors_of(Recording(), state[0], windows)
     assert all(means(errors, measure) == {"rigid": 0.0} for measure in errors.final)
@@ -142,20 +142,31 @@ def test_tables():
         replace(errors_of(Faulty(), jnp.float32(0.0), straight()), name="still"),
         replace(errors_of(ConstantVelocity(), None, straight()), name="constant velocity"),
     ]
-    lines = prediction.format_table(rows, "position", HORIZON).splitlines()
+    lines = prediction.format_table(rows, "position").splitlines()
     assert lines[0].startswith("6-step position error, m")
     assert lines[2] == "| model | rigid (n = 5) | diverged |"
     assert lines[3] == "|---|---|---|"
     assert lines[4].startswith("| still | 1.800 (")
     assert lines[4].endswith(" | 5 |")
     assert lines[5] == "| constant velocity | 0.000 (0.000-0.000) | 0 |"
-    lines = prediction.format_table([*rows, replace(rows[0], name="mixed: nesam")], "position", 6)
+    lines = prediction.format_table([*rows, replace(rows[0], name="mixed: nesam")], "position")
     assert lines.splitlines()[2].endswith("| diverged | the paper, 16 steps: rigid |")
     assert lines.splitlines()[5].endswith("| 0 |  |")
     assert lines.splitlines()[6].endswith("| 5 | 0.563 |")
     table = prediction.csv_lines(rows)
     assert len(table) == 2 * len(prediction.MEASURES)
     assert table[0]["model"] == "still" and table[0]["mean"] == pytest.approx(1.8, rel=1e-4)
+
+
+def test_errors_are_told_after_any_number_of_steps():
+    windows = straight(3)
+    test = TestWindows(windows, np.arange(3), GROUND)
+    still = prediction.predict(Faulty(), jnp.float32(0.0), test).states
+    for steps in (2, HORIZON):
+        row = prediction.summary("still", still, test, steps)
+        assert row.horizon == steps and len(row.growth["rigid"]) == steps
+        assert means(row)["rigid"] == pytest.approx(0.1 * steps * 2, rel=1e-4)
+        assert prediction.format_table([row], "position").startswith(f"{steps}-step position")
 
 
 def test_error_is_found_where_it_is():
@@ -188,7 +199,7 @@ def test_error_is_found_where_it_is():
 
 def test_the_built_in_simulator_beats_both_baselines_on_chrono_drives():
     drives, terrain = dataset.load(DRIVES, "train")
-    windows = gather(drives, index(drives, terrain, context=16, horizon=16, stride=16))
+    test = TestWindows.of(drives, terrain, context=16, horizon=16, stride=16)
     vehicle = hmmwv()
     models = (
         (Simulator(), chrono_like(vehicle)),
@@ -197,8 +208,9 @@ def test_the_built_in_simulator_beats_both_baselines_on_chrono_drives():
     )
     errors = []
     for model, params in models:
-        final = prediction.predict(model, params, terrain, windows).position[:, -1]
-        errors.append(float(jnp.linalg.norm(final - windows.state[:, -1, :3], axis=-1).mean()))
+        final = prediction.predict(model, params, test).states.position[:, -1]
+        truth = test.windows.state[:, -1, :3]
+        errors.append(float(jnp.linalg.norm(final - truth, axis=-1).mean()))
     simulator, bicycle, constant = errors
     assert jnp.isfinite(jnp.asarray(errors)).all()
     assert simulator < 0.35
@@ -210,8 +222,7 @@ def test_predictions_are_of_the_selected_worlds():
     rise = np.tile(0.2 * (np.arange(65) - 32.0), (65, 1)) + 8
     terrain = terrain_map.stack([GROUND, terrain_map.build(rise, np.full((8, 8), 3))])
     windows = straight(2).replace(world=jnp.array([0, 1]))
-    final = prediction.predict(
-        KinematicBicycle(), jax.tree.map(jnp.asarray, bicycle_of(hmmwv())), terrain, windows
-    )
+    test = TestWindows(windows, np.arange(2), terrain)
+    final = prediction.predict(KinematicBicycle(), bicycle_of(hmmwv()), test).states
     assert float(final.rpy[0, -1, 1]) == pytest.approx(0.0, abs=1e-6)
     assert float(final.rpy[1, -1, 1]) == pytest.approx(-np.arctan(0.2), abs=1e-4)

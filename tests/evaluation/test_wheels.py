@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from vertiwm_jax.evaluation import wheels
+from vertiwm_jax.evaluation import prediction, wheels
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.dataset import Auxiliary
@@ -32,9 +32,13 @@ def test(tmp_path_factory):
     return found
 
 
+def compared(test, model, params):
+    return wheels.compare(prediction.predict(model, params, test).read.wheels, test)
+
+
 @pytest.fixture(scope="module")
 def simulated(test):
-    return wheels.compare(*choose("builtin"), test)
+    return compared(test, *choose("builtin"))
 
 
 def test_wheels_of_the_simulator_go_with_those_recorded(test, simulated):
@@ -55,22 +59,22 @@ def test_every_model_with_physics_tells_of_its_wheels_and_others_do_not(test, si
     config = ModelConfig()
     params = config.init_params(jax.random.key(0), choose("builtin")[1])
     # Untrained, NeSAM is physics as it is.
-    found = wheels.compare(config.nesam, params.nesam, test)
+    found = compared(test, config.nesam, params.nesam)
     assert len(found) == 3
     np.testing.assert_allclose([x.error for x in found], [x.error for x in simulated], rtol=1e-3)
     terrain = test.terrain.select(0)
     state = VehicleState.from_vector(test.windows.state[0, 0])
-    fused = wheels.modelled(config.build().init(params, terrain, state))
+    fused = prediction.modelled(config.build().init(params, terrain, state))
     assert fused is not None
     chex.assert_trees_all_equal(
-        fused, wheels.modelled(config.nesam.init(params.nesam, terrain, state))
+        fused, prediction.modelled(config.nesam.init(params.nesam, terrain, state))
     )
-    assert wheels.compare(ConstantVelocity(), None, test) == []
+    assert compared(test, ConstantVelocity(), None) == []
 
 
 def test_what_was_not_recorded_is_not_compared(test, simulated):
     speed = test.windows.auxiliary.wheel_omega
     some = replace(test, windows=test.windows.replace(auxiliary=Auxiliary(wheel_omega=speed)))
-    assert wheels.compare(*choose("builtin"), some) == [simulated[1]]
+    assert compared(some, *choose("builtin")) == [simulated[1]]
     none = replace(test, windows=test.windows.replace(auxiliary=Auxiliary()))
-    assert wheels.compare(*choose("builtin"), none) == []
+    assert compared(none, *choose("builtin")) == []

@@ -1,6 +1,5 @@
 """Recorded drives: the command, what it writes, and what is left when it is stopped."""
 
-import io
 import json
 import math
 
@@ -81,16 +80,16 @@ def test_drives_are_read_as_recorded(collected, maps):
 
 
 def test_going_on_is_as_if_never_stopped(collected, maps, tmp_path, monkeypatch, capsys):
-    archive, left = recording.archive, []
+    write, left = recording.write, []
 
-    def stopping(drives, steps, meta, vehicle):
+    def stopping(path, drives, steps, meta, vehicle):
         if meta["world"] == 1:
             left.extend(path.name for path in (tmp_path / "drives").iterdir())
             raise KeyboardInterrupt
-        return archive(drives, steps, meta, vehicle)
+        write(path, drives, steps, meta, vehicle)
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as stop:
-        patch.setattr(recording, "archive", stopping)
+        patch.setattr(recording, "write", stopping)
         run(maps, tmp_path / "drives")
     assert stop.value.code == 130
     assert sorted(left) == ["config.yaml", "maps", "world_000.npz"]
@@ -186,7 +185,7 @@ class Scripted:
         (0, 60.0, "time", 5),
     ],
 )
-def test_endings(maps, index, value, ending, length):
+def test_endings(maps, tmp_path, index, value, ending, length):
     states = np.zeros((6, 12))
     states[3:, index] = value
     level = files.load(maps / "map_0.npz")
@@ -195,7 +194,8 @@ def test_endings(maps, index, value, ending, length):
     assert (drive.ending, len(drive.control), len(drive.observations)) == (
         ending, length, length + 1,
     )  # fmt: skip
-    file = np.load(io.BytesIO(recording.archive([drive], 5, {"map": "a"}, hmmwv())))
+    recording.write(tmp_path / "a.npz", [drive], 5, {"map": "a"}, hmmwv())
+    file = np.load(tmp_path / "a.npz")
     assert file["length"] == [length] and file["state"].shape == (1, 6, 12)
     assert json.loads(str(file["meta"]))["dt"] == 0.1
 

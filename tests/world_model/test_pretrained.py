@@ -37,7 +37,9 @@ def test_it_predicts_as_it_always_did(windows, operands):
 
 
 def mean_error(name, windows):
-    errors, lost = prediction.absolute_errors(*choose(name), windows)
+    errors, lost = prediction.absolute_errors(
+        prediction.predict(*choose(name), windows).states, windows
+    )
     assert not lost.any(), name
     return errors["position"][:, -1].mean()
 

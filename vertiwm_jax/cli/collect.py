@@ -215,4 +215,4 @@ def _write(
         "world": world,
         "seed": command.seed,
     }
-    runs.write_atomic(path, recording.archive(drives, command.steps, meta, vehicle.vehicle))
+    recording.write(path, drives, command.steps, meta, vehicle.vehicle)

@@ -72,8 +72,8 @@ class Prediction:
     """Which of the drives."""
     context: CountOrZero = 16
     """Recorded steps that a model sees first."""
-    horizon: Count = 16
-    """Steps that it predicts."""
+    horizon: Annotated[tuple[Count, ...], AtLeastOne] = (16,)
+    """Steps that it predicts; of several numbers of steps there is a table each."""
     stride: Count = 16
     """Steps from one window to the next."""
     output: Path | None = None
@@ -190,7 +190,8 @@ def run(name: str, words: Sequence[str]) -> None:
 
 def _predict(command: Prediction) -> None:
     drives, terrain = dataset.load(command.data, command.split)
-    test = TestWindows.of(drives, terrain, command.context, command.horizon, command.stride)
+    longest = max(command.horizon)
+    test = TestWindows.of(drives, terrain, command.context, longest, command.stride)
     driven = vehicle.load(command.vehicle).vehicle
     chosen = command.weights, command.soil, driven
     models: dict[str, tuple[Dynamics, Params]] = {
@@ -199,10 +200,15 @@ def _predict(command: Prediction) -> None:
         "kinematic bicycle": (KinematicBicycle(), bicycle_of(driven)),
         "constant velocity": (ConstantVelocity(), None),
     }
-    rows = [prediction.evaluate(name, *models[name], test) for name in models]
-    print(f"\n{prediction.format_table(rows, 'position', command.horizon)}", flush=True)
+    predicted = {name: prediction.predict(*model, test) for name, model in models.items()}
+    rows = [
+        [prediction.summary(name, found.states, test, steps) for name, found in predicted.items()]
+        for steps in sorted(command.horizon)
+    ]
+    for of_models in rows:
+        print(f"\n{prediction.format_table(of_models, 'position')}", flush=True)
     if command.output:
-        shown = {name: models[name] for name in command.models}
+        shown = {name: predicted[name] for name in command.models}
         prediction_report.write(command.output, rows, test, shown)
 
 

@@ -13,6 +13,7 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import froude, runs
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import AtLeastOne, settings
+from vertiwm_jax.evaluation.tables import markdown
 from vertiwm_jax.importers import collection, grid_map, resampling, rosbag, table, tartandrive
 from vertiwm_jax.importers.log import Log
 from vertiwm_jax.importers.resampling import Drive
@@ -97,7 +98,7 @@ def import_drives(command: ImportDrives) -> str:
         meta = {"sources": [str(source) for source in command.sources]}
         wheels = settings.vehicle.wheels_in_body_xy
         collection.write(unfinished, drives, terrain, wheels, meta)
-    return "\n".join([*_table(imported), "", *said, *_remarks(drives, terrain)])
+    return "\n".join([_table(imported), "", *said, *_remarks(drives, terrain)])
 
 
 def _reader(source: Path, asked: Format | None) -> Callable[[Path, ImportSettings], list[Log]]:
@@ -166,18 +167,15 @@ def _check(source: Path, drives: Sequence[Drive]) -> None:
         )
 
 
-def _table(imported: Sequence[Imported]) -> list[str]:
-    lines = [
-        "| log | poses a second | from poses | drives | steps | left out |",
-        "|---|---|---|---|---|---|",
-    ]
+def _table(imported: Sequence[Imported]) -> str:
+    rows = []
     for each in imported:
         steps = sum(len(drive.control) for drive in each.drives)
-        lines.append(
-            f"| {each.source} | {each.poses_per_second:.1f} | {', '.join(each.derived) or '-'} "
-            f"| {len(each.drives)} | {steps:,} | {_reasons(each)} |"
-        )
-    return lines
+        speed, derived = f"{each.poses_per_second:.1f}", ", ".join(each.derived) or "-"
+        drives = f"{len(each.drives)}", f"{steps:,}"
+        rows.append((str(each.source), speed, derived, *drives, _reasons(each)))
+    heads = ["log", "poses a second", "from poses", "drives", "steps", "left out"]
+    return markdown(heads, rows)
 
 
 def _reasons(each: Imported) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from vertiwm_jax.adaptation.soil_filter import SoilBelief, SoilFilter, believed
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.evaluation.prediction import BATCH, Interval, bootstrap
+from vertiwm_jax.evaluation.tables import markdown
 from vertiwm_jax.learning import windows as recorded
 from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.learning.rollouts import open_loop
@@ -221,9 +222,7 @@ def format_errors(found: Mapping[str, Mapping[str, tuple[int, Interval]]]) -> st
 
 def format_rows(rows: Sequence[Mapping[str, str]]) -> str:
     """A Markdown table of rows with the same columns."""
-    heads = list(rows[0])
-    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
-    return "\n".join([*lines, *(f"| {' | '.join(row.values())} |" for row in rows)])
+    return markdown(list(rows[0]), (list(row.values()) for row in rows))
 
 
 def _repeated(soils: Soil, times: int) -> Soil:

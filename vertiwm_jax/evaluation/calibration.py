@@ -11,19 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Self
 
-import jax
 import numpy as np
 
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.evaluation.plots import line, sheet, style
-from vertiwm_jax.evaluation.prediction import BATCH, TestWindows
-from vertiwm_jax.learning.rollouts import open_loop
+from vertiwm_jax.evaluation.prediction import TestWindows, predict
+from vertiwm_jax.evaluation.tables import markdown
 from vertiwm_jax.learning.schema import DataError
-from vertiwm_jax.learning.windows import Windows
-from vertiwm_jax.terrain.map import TerrainMap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,28 +85,14 @@ def signs(
     telling first, summed over the predicted steps; the history of the model has to hold both, as
     Verti-WM's does. `DataError` if a prediction is not finite.
     """
-    last, apart, spread = map(np.asarray, _rolled(model, params, test.terrain, test.windows))
-    error = np.linalg.norm(last - np.asarray(test.windows.state[:, -1, :3]), axis=-1)
+    states, read = predict(model, params, test)
+    apart, spread = read.disagreement.sum(axis=1), read.spread.sum(axis=1)
+    last = np.asarray(test.windows.state[:, -1, :3])
+    error = np.linalg.norm(states.position[:, -1] - last, axis=-1)
     if lost := int(np.sum(~np.isfinite(error))):
         raise DataError(f"expected finite predictions, found {lost} of {len(error)} that are not")
     several = {"gates": spread} if np.any(spread) else {}
     return error, several | {"specialists": apart}
-
-
-@partial(jax.jit, static_argnames="model")
-def _rolled(
-    model: Dynamics, params: Params, terrain: TerrainMap, windows: Windows
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Last positions `[N, 3]`, and sums of disagreement and spread `[N]`, m."""
-
-    def one(window: Windows) -> tuple[jax.Array, jax.Array, jax.Array]:
-        ground = terrain.select(window.world)
-        states, (apart, spread) = open_loop(
-            model, params, ground, window, lambda h: (h.disagreement, h.spread)
-        )
-        return states.position[-1], apart.sum(), spread.sum()
-
-    return jax.lax.map(one, windows, batch_size=BATCH)
 
 
 def coverage(
@@ -137,22 +119,20 @@ def format_parts(error: np.ndarray, disagreement: np.ndarray) -> str:
         "mean error, m": [error[part].mean() for part in parts],
         "95 % of errors below, m": [np.quantile(error[part], 0.95) for part in parts],
     }
-    heads = ["least disagreement", *[""] * (PARTS - 2), "most"]
-    lines = [f"| windows | {' | '.join(heads)} |", "|" + "---|" * (PARTS + 1)]
-    lines += [f"| {name} | {' | '.join(f'{x:.3f}' for x in row)} |" for name, row in rows.items()]
-    return "\n".join(lines)
+    heads = ["windows", "least disagreement", *[""] * (PARTS - 2), "most"]
+    return markdown(heads, ([name, *(f"{x:.3f}" for x in row)] for name, row in rows.items()))
 
 
 def format_coverage(rows: Mapping[str, Sequence[Coverage]]) -> str:
     """A Markdown table of how often bounds held, by how they were found."""
     heads = ["bound for", "found from", "mean bound, m", "held for", "by disagreement, least first"]
-    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    lines = []
     for at_level in zip(*rows.values(), strict=True):
         for name, row in zip(rows, at_level, strict=True):
             parts = " / ".join(f"{part:.0%}" for part in row.parts)
-            cells = [f"{row.level:.0%}", name, f"{row.mean_bound:.3f}", f"{row.held:.1%}", parts]
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+            held = f"{row.held:.1%}"
+            lines.append((f"{row.level:.0%}", name, f"{row.mean_bound:.3f}", held, parts))
+    return markdown(heads, lines)
 
 
 def picture(

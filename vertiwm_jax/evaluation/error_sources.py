@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax.evaluation.prediction import TestWindows
+from vertiwm_jax.evaluation.tables import markdown
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -59,13 +60,12 @@ def locate(test: TestWindows, error: np.ndarray) -> list[Share]:
 
 def format_shares(shares: Sequence[Share]) -> str:
     """A Markdown table."""
-    lines = ["| | | windows | mean error, m | share of the error |", "|---|---|---|---|---|"]
-    before = ""
+    rows, before = [], ""
     for x in shares:
         name = x.quantity if x.quantity != before else ""
         before = x.quantity
-        lines.append(f"| {name} | {x.value} | {x.windows:.0%} | {x.mean:.3f} | {x.error:.0%} |")
-    return "\n".join(lines)
+        rows.append((name, x.value, f"{x.windows:.0%}", f"{x.mean:.3f}", f"{x.error:.0%}"))
+    return markdown(["", "", "windows", "mean error, m", "share of the error"], rows)
 
 
 def _share(quantity: str, value: str, rows: np.ndarray, error: np.ndarray) -> Share:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Self
 
 from vertiwm_jax import runs
+from vertiwm_jax.evaluation import tables
 from vertiwm_jax.evaluation.navigation import Summary
 from vertiwm_jax.evaluation.published import DRIVING
 from vertiwm_jax.evaluation.report import Results
@@ -31,22 +32,20 @@ class TrainingCost:
 def markdown(costs: Mapping[str, TrainingCost], judged: Mapping[str, Mapping[str, Results]]) -> str:
     """A table for each simulator: costs of the trained policies, and how they drive by suite:
     successes, their mean time, and mean absolute roll and pitch."""
-    tables = (f"**{name}**\n\n{_table(costs, groups)}" for name, groups in judged.items())
-    return "\n\n".join(tables)
+    return "\n\n".join(f"**{name}**\n\n{_table(costs, groups)}" for name, groups in judged.items())
 
 
 def _table(costs: Mapping[str, TrainingCost], groups: Mapping[str, Results]) -> str:
     heads = ["policy", "training [min]", "transitions/s", *groups, "the paper, in Chrono"]
-    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    rows = []
     for policy in next(iter(groups.values())):
         cost = next((x for name, x in costs.items() if policy.startswith(name)), None)
         spent = ["", ""]
         if cost:
             spent = [f"{cost.seconds / 60:.1f}", f"{cost.transitions / cost.seconds:,.0f}"]
         driven = [_cell(Summary.of(results[policy])) for results in groups.values()]
-        cells = [policy, *spent, *driven, DRIVING.get(policy, "")]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append([policy, *spent, *driven, DRIVING.get(policy, "")])
+    return tables.markdown(heads, rows)
 
 
 def _cell(row: Summary) -> str:

@@ -3,20 +3,25 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax import geometry
-from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.dynamics import Dynamics, History, Params, disagreement, spread
 from vertiwm_jax.evaluation.published import POSITION_ERRORS
+from vertiwm_jax.evaluation.tables import markdown
 from vertiwm_jax.learning import windows as recorded
-from vertiwm_jax.learning.dataset import Drives
+from vertiwm_jax.learning.dataset import Auxiliary, Drives
 from vertiwm_jax.learning.rollouts import open_loop
 from vertiwm_jax.learning.windows import GROUNDS, Windows
+from vertiwm_jax.mechanics.simulator import SimulatorHistory
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model.model import VertiWMHistory
+from vertiwm_jax.world_model.nesam import NesamHistory
 
 MEASURES = {
     "position": "m",
@@ -68,7 +73,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """Errors of one model.
+    """Errors of one model after so many steps, the horizon.
 
     final: by measure and then by kind of ground, mean absolute error after the last step.
     growth: by kind of ground, mean position error after each step, m.
@@ -77,35 +82,76 @@ class PredictionErrors:
     """
 
     name: str
+    horizon: int
     final: dict[str, dict[str, Interval]]
     growth: dict[str, list[float]]
     count: dict[str, int]
     diverged: int
 
 
-@partial(jax.jit, static_argnames="dynamics")
-def predict(
-    dynamics: Dynamics, params: Params, terrain: TerrainMap, windows: Windows
-) -> VehicleState:
-    """The K states predicted in every window: leaves `[N, K, 3]`.
+class Reading(NamedTuple):
+    """What a model tells of itself after a step; None for what it does not have.
+
+    coefficients: `[4]` of the fusion. disagreement, spread: `[]` m, of specialists and of gates.
+    wheels: leaves `[4, ...]`.
+    """
+
+    coefficients: Any
+    disagreement: Any
+    spread: Any
+    wheels: Auxiliary | None
+
+    @classmethod
+    def of(cls, history: History) -> Self:
+        """Read from the history after the step."""
+        alpha = getattr(history, "coefficients", None)
+        return cls(alpha, disagreement(history), spread(history), modelled(history))
+
+
+def modelled(history: History) -> Auxiliary | None:
+    """What a model keeps of its wheels, if it has any; forces are of the last sub-step."""
+    match history:
+        case VertiWMHistory(nesam=specialist):
+            return modelled(specialist)
+        case NesamHistory(simulator=memory):
+            return modelled(memory)
+        case SimulatorHistory(wheel_speed=speed, sinkage=sinkage, force=force):
+            return Auxiliary(wheel_omega=speed, wheel_sinkage=sinkage, wheel_force=force)
+    return None
+
+
+class Predicted(NamedTuple):
+    """The K states predicted in N windows, leaves `[N, K, 3]`, and what was read after each."""
+
+    states: VehicleState
+    read: Reading
+
+
+def predict(dynamics: Dynamics, params: Params, test: TestWindows) -> Predicted:
+    """Open-loop predictions of every window, in host memory.
 
     The history is warmed up on the recorded context; from its last state on, the model sees its
     own predictions and the recorded commands (the paper's protocol, Sec. V-A).
     """
+    return jax.device_get(_predict(dynamics, params, test.terrain, test.windows))
 
-    def one(window: Windows) -> VehicleState:
+
+@partial(jax.jit, static_argnames="dynamics")
+def _predict(
+    dynamics: Dynamics, params: Params, terrain: TerrainMap, windows: Windows
+) -> Predicted:
+    def one(window: Windows) -> Predicted:
         ground = terrain.select(window.world)
-        return open_loop(dynamics, params, ground, window, lambda _: None)[0]
+        return Predicted(*open_loop(dynamics, params, ground, window, Reading.of))
 
     return jax.lax.map(one, windows, batch_size=BATCH)
 
 
 def absolute_errors(
-    dynamics: Dynamics, params: Params, test: TestWindows
+    predicted: VehicleState, test: TestWindows
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """By measure, `[N, K]` in its unit, and `[N]` bool, whether the prediction diverged."""
     windows = test.windows
-    predicted = predict(dynamics, params, test.terrain, windows)
     truth = windows.state[:, windows.context + 1 :, :6]
     start = windows.state[:, windows.context, None, :6]
     pose = jnp.concatenate([predicted.position, predicted.rpy], axis=-1)
@@ -124,17 +170,28 @@ def absolute_errors(
 
 
 def evaluate(name: str, dynamics: Dynamics, params: Params, test: TestWindows) -> PredictionErrors:
-    """Errors after the last step of every window, by kind of ground."""
-    errors, lost = absolute_errors(dynamics, params, test)
+    """Errors of a model after the last step of every window, by kind of ground."""
+    return summary(name, predict(dynamics, params, test).states, test)
+
+
+def summary(
+    name: str, predicted: VehicleState, test: TestWindows, horizon: int | None = None
+) -> PredictionErrors:
+    """Errors of predictions after `horizon` steps, by default all of them, by kind of ground."""
+    errors, lost = absolute_errors(predicted, test)
+    horizon = int(horizon or errors["position"].shape[1])
     ground = np.asarray(test.windows.ground)
     rows = {kind: ground == i for i, kind in enumerate(GROUNDS) if (ground == i).any()}
     final = {
-        measure: {kind: bootstrap(error[row, -1], test.drive[row]) for kind, row in rows.items()}
+        measure: {
+            kind: bootstrap(error[row, horizon - 1], test.drive[row]) for kind, row in rows.items()
+        }
         for measure, error in errors.items()
     }
-    growth = {kind: errors["position"][row].mean(axis=0).tolist() for kind, row in rows.items()}
+    position = errors["position"][:, :horizon]
+    growth = {kind: position[row].mean(axis=0).tolist() for kind, row in rows.items()}
     count = {kind: int(row.sum()) for kind, row in rows.items()}
-    return PredictionErrors(name, final, growth, count, int(lost.sum()))
+    return PredictionErrors(name, horizon, final, growth, count, int(lost.sum()))
 
 
 def prediction_errors(
@@ -169,18 +226,13 @@ def prediction_errors(
     return evaluate(name, dynamics, params, test)
 
 
-def format_table(rows: Sequence[PredictionErrors], measure: str, horizon: int) -> str:
+def format_table(rows: Sequence[PredictionErrors], measure: str) -> str:
     """A Markdown table of one measure, one model a row; the paper's figures where it has them."""
     kinds = list(rows[0].count)
     published = [_published(row, measure) for row in rows]
     heads = ["model", *(f"{kind} (n = {rows[0].count[kind]})" for kind in kinds), "diverged"]
     heads += [f"the paper, 16 steps: {' / '.join(kinds)}"] if any(published) else []
-    lines = [
-        f"{horizon}-step {measure} error, {MEASURES[measure]}: mean and 95 % interval over drives",
-        "",
-        f"| {' | '.join(heads)} |",
-        "|" + "---|" * len(heads),
-    ]
+    lines = []
     for row, paper in zip(rows, published, strict=True):
         found = [row.final[measure][kind] for kind in kinds]
         cells = [row.name, *(f"{x.mean:.3f} ({x.low:.3f}-{x.high:.3f})" for x in found)]
@@ -188,8 +240,9 @@ def format_table(rows: Sequence[PredictionErrors], measure: str, horizon: int) -
         if any(published):
             figures = [f"{paper[kind]:.3f}" if kind in paper else "-" for kind in kinds]
             cells.append(" / ".join(figures) if paper else "")
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append(cells)
+    title = f"{rows[0].horizon}-step {measure} error, {MEASURES[measure]}"
+    return f"{title}: mean and 95 % interval over drives\n\n{markdown(heads, lines)}"
 
 
 def csv_lines(rows: Sequence[PredictionErrors]) -> list[Mapping[str, str | float]]:
@@ -197,6 +250,7 @@ def csv_lines(rows: Sequence[PredictionErrors]) -> list[Mapping[str, str | float
     return [
         {
             "model": row.name,
+            "steps": row.horizon,
             "measure": measure,
             "unit": MEASURES[measure],
             "ground": kind,

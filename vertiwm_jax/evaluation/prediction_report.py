@@ -1,74 +1,85 @@
 """What a test of predictions leaves behind: tables, pictures, and where the error is."""
 
-import operator
+from __future__ import annotations
+
+import math
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
 from vertiwm_jax import runs
-from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.evaluation import error_sources, plots, prediction, prediction_plots, wheels
-from vertiwm_jax.evaluation.prediction import BATCH, MEASURES, PredictionErrors, TestWindows
-from vertiwm_jax.learning.rollouts import open_loop
+from vertiwm_jax.evaluation import error_sources, plots, prediction, wheels
+from vertiwm_jax.evaluation.plots import line, sheet, style
+from vertiwm_jax.evaluation.prediction import (
+    BATCH,
+    MEASURES,
+    Predicted,
+    PredictionErrors,
+    TestWindows,
+)
 from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.fusion import COEFFICIENTS
-from vertiwm_jax.world_model.model import VertiWM, VertiWMParams
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SHARES = (0.25, 0.5, 0.75, 0.95)
 """Windows that are pictured: those than which this share of all on such ground err less."""
 AROUND = 8
 """Steps before and after a crossing in which fusion coefficients are pictured."""
+COLUMNS = 4
+"""Panels side by side."""
 
 
 def write(
     folder: Path,
-    rows: Sequence[PredictionErrors],
+    rows: Sequence[Sequence[PredictionErrors]],
     test: TestWindows,
-    models: Mapping[str, tuple[Dynamics, Params]],
+    predicted: Mapping[str, Predicted],
 ) -> None:
-    """All measures as Markdown and CSV, and pictures; the first of the models is looked into."""
+    """All measures as Markdown and CSV, and pictures.
+
+    rows: of all models, for each horizon, the longest last. predicted: what models predict whose
+        paths are drawn; the first of them is looked into.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    name, (best, params) = next(iter(models.items()))
-    error = prediction.absolute_errors(best, params, test)[0]["position"][:, -1]
-    horizon = test.windows.control.shape[1] - test.windows.context
-    tables = [prediction.format_table(rows, measure, horizon) for measure in MEASURES]
+    name, (states, read) = next(iter(predicted.items()))
+    error = prediction.absolute_errors(states, test)[0]["position"][:, -1]
+    tables = [prediction.format_table(models, measure) for models in rows for measure in MEASURES]
     tables.append(f"Position error of {name}, where it is\n")
     tables.append(error_sources.format_shares(error_sources.locate(test, error)))
-    if turning := wheels.compare(best, params, test):
+    if turning := wheels.compare(read.wheels, test):
+        horizon = states.position.shape[1]
         tables.append(f"Wheels of {name} after {horizon} steps, beside those recorded\n")
         tables.append(wheels.format_table(turning))
     runs.write_atomic(folder / "prediction.md", "\n\n".join(tables) + "\n")
-    runs.write_atomic(folder / "prediction.csv", runs.csv_text(prediction.csv_lines(rows)))
+    lines = [line for models in rows for line in prediction.csv_lines(models)]
+    runs.write_atomic(folder / "prediction.csv", runs.csv_text(lines))
 
-    growth = {row.name: row.growth for row in rows}
-    plots.save(prediction_plots.error_growth(growth, STEP_SECONDS), folder / "prediction.png")
-    plots.save(prediction_plots.paths(_panels(test, error, models)), folder / "paths.png")
-    if isinstance(best, VertiWM):
-        found = _coefficients(best, params, test.terrain, test.windows)
-        traces = crossings(test, np.asarray(found))
-        if traces:
-            seconds = STEP_SECONDS * np.arange(-AROUND, AROUND + 1)
-            figure = prediction_plots.coefficients(traces, COEFFICIENTS, seconds)
-            plots.save(figure, folder / "coefficients.png")
+    growth = {row.name: row.growth for row in rows[-1]}
+    plots.save(error_growth(growth, STEP_SECONDS), folder / "prediction.png")
+    plots.save(paths(_panels(test, error, predicted)), folder / "paths.png")
+    if read.coefficients is not None and (traces := crossings(test, read.coefficients)):
+        seconds = STEP_SECONDS * np.arange(-AROUND, AROUND + 1)
+        figure = coefficients(traces, COEFFICIENTS, seconds)
+        plots.save(figure, folder / "coefficients.png")
 
 
 def _panels(
-    test: TestWindows, error: np.ndarray, models: Mapping[str, tuple[Dynamics, Params]]
+    test: TestWindows, error: np.ndarray, predicted: Mapping[str, Predicted]
 ) -> list[tuple[str, dict[str, np.ndarray]]]:
     """On every kind of ground, windows that are predicted well to badly."""
     c, ground = test.windows.context, np.asarray(test.windows.ground)
     state = np.asarray(test.windows.state)
     lines = {"recorded": state[:, c:, :2]}
-    for name, (model, params) in models.items():
-        predicted = prediction.predict(model, params, test.terrain, test.windows)
-        start = state[:, c, None, :2]
-        lines[name] = np.concatenate([start, np.asarray(predicted.position)[..., :2]], axis=1)
+    for name, (states, _) in predicted.items():
+        lines[name] = np.concatenate([state[:, c, None, :2], states.position[..., :2]], axis=1)
     panels = []
     for kind in sorted(set(ground)):
         found = np.flatnonzero(ground == kind)
@@ -87,19 +98,6 @@ def _ahead(start: np.ndarray, path: np.ndarray) -> np.ndarray:
     return (path - start[:2]) @ np.array([[cos, -sin], [sin, cos]])
 
 
-@partial(jax.jit, static_argnames="model")
-def _coefficients(
-    model: VertiWM, params: VertiWMParams, terrain: TerrainMap, windows: Windows
-) -> jax.Array:
-    """`[N, K, 4]` alpha of every predicted step."""
-
-    def one(window: Windows) -> jax.Array:
-        world = terrain.select(window.world)
-        return open_loop(model, params, world, window, operator.attrgetter("coefficients"))[1]
-
-    return jax.lax.map(one, windows, batch_size=BATCH)
-
-
 @jax.jit
 def _on_soil(terrain: TerrainMap, windows: Windows) -> jax.Array:
     """`[N, K + 1]` whether there is soil below the recorded vehicle."""
@@ -111,10 +109,10 @@ def _on_soil(terrain: TerrainMap, windows: Windows) -> jax.Array:
     return jax.lax.map(one, windows, batch_size=BATCH)
 
 
-def crossings(test: TestWindows, coefficients: np.ndarray) -> dict[str, np.ndarray]:
+def crossings(test: TestWindows, alphas: np.ndarray) -> dict[str, np.ndarray]:
     """Mean coefficients `[2 AROUND + 1, C]` about the crossing of a border of soil, by direction.
 
-    coefficients: `[N, K, C]` of all predicted steps. Only windows that cross once count; NaN
+    alphas: `[N, K, C]` of all predicted steps. Only windows that cross once count; NaN
     where none of them reaches.
     """
     soft = np.asarray(_on_soil(test.terrain, test.windows))
@@ -125,13 +123,83 @@ def crossings(test: TestWindows, coefficients: np.ndarray) -> dict[str, np.ndarr
         rows = np.flatnonzero((changed.sum(axis=1) == 1) & (soft[:, -1] == onto))
         if not len(rows):
             continue
-        shifted = np.full((len(rows), 2 * AROUND + 1, coefficients.shape[-1]), np.nan)
+        shifted = np.full((len(rows), 2 * AROUND + 1, alphas.shape[-1]), np.nan)
         for i, row in enumerate(rows):
             place = np.arange(-AROUND, AROUND + 1) + changed[row].argmax()
             inside = (place >= 0) & (place < steps)
-            shifted[i, inside] = coefficients[row, place[inside]]
+            shifted[i, inside] = alphas[row, place[inside]]
         count = np.isfinite(shifted).sum(axis=0)
         total = np.nansum(shifted, axis=0)
         mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
         traces[f"{title} ({len(rows)} windows)"] = mean
     return traces
+
+
+def error_growth(
+    growth: Mapping[str, Mapping[str, Sequence[float]]], step_seconds: float
+) -> Figure:
+    """Position error over the time predicted, a panel for each kind of ground.
+
+    growth: by model and then by kind, m after each step.
+    """
+    kinds = list(next(iter(growth.values())))
+    with style():
+        figure = sheet(3.2 * len(kinds), 2.8)
+        panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
+        for axes, kind in zip(panels, kinds, strict=True):
+            for i, (name, by_kind) in enumerate(growth.items()):
+                colour, dash = line(i)
+                seconds = step_seconds * (1 + np.arange(len(by_kind[kind])))
+                axes.plot(seconds, by_kind[kind], dash, label=name, color=colour)
+            axes.set(title=kind, xlabel="time [s]", xlim=(0, None), yscale="log")
+        panels[0].set_ylabel("position error [m]")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    return figure
+
+
+def paths(panels: Sequence[tuple[str, Mapping[str, np.ndarray]]]) -> Figure:
+    """Paths seen from above, a panel for each window: its title, and `[T, 2]` m by name.
+
+    x is forward, drawn upwards, and y to the left. The first of each panel is the recorded one.
+    """
+    with style():
+        rows = math.ceil(len(panels) / COLUMNS)
+        figure = sheet(2.4 * COLUMNS, 2.5 * rows + 0.3)
+        grid = figure.subplots(rows, COLUMNS, squeeze=False)
+        for axes, (title, lines) in zip(grid.flat, panels, strict=False):
+            for i, (name, path) in enumerate(lines.items()):
+                colour, dash = ("black", "-") if i == 0 else line(i - 1)
+                ends = "o" if i == 0 else "s"
+                axes.plot(-path[:, 1], path[:, 0], dash, color=colour, label=name)
+                axes.plot(-path[-1, 1], path[-1, 0], ends, color=colour, markersize=3.5)
+            axes.set_title(title, fontsize=8)
+            axes.set_aspect("equal", adjustable="datalim")
+        for axes in grid.flat[len(panels) :]:
+            axes.set_axis_off()
+        figure.supxlabel("to the right [m]")
+        figure.supylabel("forward [m]")
+        handles = grid.flat[0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside upper center", ncols=len(handles[0]))
+    return figure
+
+
+def coefficients(
+    traces: Mapping[str, np.ndarray], groups: Sequence[str], seconds: np.ndarray
+) -> Figure:
+    """Fusion coefficients about the moment in which a border of soil is crossed.
+
+    traces: by direction, means `[T, G]`, NaN where there are none; groups: names of the G.
+    seconds: `[T]` since the crossing.
+    """
+    with style():
+        figure = sheet(3.6 * len(traces), 2.9)
+        panels = figure.subplots(1, len(traces), sharey=True, squeeze=False)[0]
+        for axes, (title, trace) in zip(panels, traces.items(), strict=True):
+            for i, name in enumerate(groups):
+                colour, dash = line(i)
+                axes.plot(seconds, trace[:, i], dash, color=colour, label=name)
+            axes.axvline(0.0, color="0.6", linewidth=0.8)
+            axes.set(title=title, xlabel="time since the crossing [s]")
+        panels[0].set_ylabel("0 Transformer, 1 NeSAM")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    return figure

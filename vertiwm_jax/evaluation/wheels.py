@@ -3,21 +3,15 @@
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.dynamics import Dynamics, History, Params
-from vertiwm_jax.evaluation.prediction import BATCH, TestWindows
+from vertiwm_jax.evaluation.prediction import TestWindows
+from vertiwm_jax.evaluation.tables import markdown
 from vertiwm_jax.learning.dataset import Array, Auxiliary
-from vertiwm_jax.learning.rollouts import open_loop
-from vertiwm_jax.learning.windows import GROUNDS, Windows
-from vertiwm_jax.mechanics.simulator import SimulatorHistory
-from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.model import VertiWMHistory
-from vertiwm_jax.world_model.nesam import NesamHistory
+from vertiwm_jax.learning.windows import GROUNDS
 
 
 @dataclass(frozen=True)
@@ -34,16 +28,18 @@ class WheelError:
     correlation: float
 
 
-def compare(dynamics: Dynamics, params: Params, test: TestWindows) -> list[WheelError]:
-    """Sinkage in soil, speed and force of wheels; nothing of what is not modelled or recorded."""
-    recorded = test.windows.auxiliary
-    predicted = _predict(dynamics, params, test.terrain, test.windows) or Auxiliary()
+def compare(predicted: Auxiliary | None, test: TestWindows) -> list[WheelError]:
+    """Sinkage in soil, speed and force of wheels; nothing of what is not modelled or recorded.
+
+    predicted: leaves `[N, K, 4, ...]`, by a model that has wheels.
+    """
+    recorded, predicted = test.windows.auxiliary, predicted or Auxiliary()
     found = []
     for name, read in _QUANTITIES.items():
         truth, ours = read(recorded), read(predicted)
         if truth is None or ours is None:
             continue
-        truth, ours = np.asarray(truth[:, -1]), np.asarray(ours)
+        truth, ours = np.asarray(truth[:, -1]), np.asarray(ours[:, -1])
         for i, kind in enumerate(GROUNDS):
             rows = np.asarray(test.windows.ground) == i
             # On rigid ground, and on the rigid side of a border, no wheel sinks.
@@ -54,14 +50,12 @@ def compare(dynamics: Dynamics, params: Params, test: TestWindows) -> list[Wheel
 
 def format_table(errors: Sequence[WheelError]) -> str:
     """A Markdown table."""
-    lines = [
-        "| wheels | ground | recorded mean | mean error | correlation |",
-        "|---|---|---|---|---|",
+    heads = ["wheels", "ground", "recorded mean", "mean error", "correlation"]
+    rows = [
+        (x.quantity, x.ground, *(f"{y:.3g}" for y in (x.recorded, x.error, x.correlation)))
+        for x in errors
     ]
-    for x in errors:
-        cells = x.quantity, x.ground, *(f"{y:.3g}" for y in (x.recorded, x.error, x.correlation))
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    return markdown(heads, rows)
 
 
 _SINKAGE = "sinkage, mm"
@@ -83,32 +77,6 @@ _QUANTITIES: Mapping[str, Callable[[Auxiliary], Array | None]] = {
     "speed, rad/s": operator.attrgetter("wheel_omega"),
     "force, kN": _force,
 }
-
-
-def modelled(history: History) -> Auxiliary | None:
-    """What a model keeps of its wheels, if it has any; forces are of the last sub-step."""
-    match history:
-        case VertiWMHistory(nesam=specialist):
-            return modelled(specialist)
-        case NesamHistory(simulator=memory):
-            return modelled(memory)
-        case SimulatorHistory(wheel_speed=speed, sinkage=sinkage, force=force):
-            return Auxiliary(wheel_omega=speed, wheel_sinkage=sinkage, wheel_force=force)
-    return None
-
-
-@partial(jax.jit, static_argnames="dynamics")
-def _predict(
-    dynamics: Dynamics, params: Params, terrain: TerrainMap, windows: Windows
-) -> Auxiliary | None:
-    """Of the last step, leaves `[N, 4, ...]`."""
-
-    def one(window: Windows) -> Auxiliary | None:
-        world = terrain.select(window.world)
-        wheels = open_loop(dynamics, params, world, window, modelled)[1]
-        return jax.tree.map(lambda x: x[-1], wheels)
-
-    return jax.lax.map(one, windows, batch_size=BATCH)
 
 
 def _error(quantity: str, ground: str, ours: np.ndarray, truth: np.ndarray) -> WheelError:

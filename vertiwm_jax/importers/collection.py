@@ -1,7 +1,5 @@
 """Writes imported drives as a collection: files in the schema, and their map."""
 
-import io
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,10 +7,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax import runs
 from vertiwm_jax.importers.resampling import Drive
+from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.dataset import SPLITS
-from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -23,16 +20,7 @@ PER_FILE = SPLITS["test"].stop
 
 def arrays(drives: Sequence[Drive]) -> dict[str, np.ndarray]:
     """K drives as arrays of the schema; shorter drives are padded with their last values."""
-    steps = max(len(drive.control) for drive in drives)
-
-    def filled(array: np.ndarray, length: int) -> np.ndarray:
-        return np.pad(array, [(0, length - len(array)), (0, 0)], "edge").astype(np.float32)
-
-    return {
-        "state": np.stack([filled(drive.state, steps + 1) for drive in drives]),
-        "control": np.stack([filled(drive.control, steps) for drive in drives]),
-        "length": np.array([len(drive.control) for drive in drives], np.int32),
-    }
+    return schema.join([{"state": drive.state, "control": drive.control} for drive in drives])
 
 
 def write(
@@ -45,13 +33,9 @@ def write(
     """Writes all drives, in their order, and the map into an empty folder."""
     (folder / "maps").mkdir()
     files.save(terrain, folder / "maps" / MAP)
-    vehicle = {"wheels_in_body_xy": wheels_in_body_xy}
-    text = json.dumps({**meta, "map": MAP, "dt": STEP_SECONDS, "vehicle": vehicle})
     for number, first in enumerate(range(0, len(drives), PER_FILE)):
-        stream = io.BytesIO()
-        columns = arrays(drives[first : first + PER_FILE])
-        np.savez_compressed(stream, allow_pickle=False, meta=np.array(text), **columns)
-        runs.write_atomic(folder / f"drives_{number:03d}.npz", stream.getvalue())
+        path, some = folder / f"drives_{number:03d}.npz", drives[first : first + PER_FILE]
+        schema.write(path, arrays(some), {**meta, "map": MAP}, wheels_in_body_xy)
 
 
 def on_map(terrain: TerrainMap, drive: Drive) -> bool:

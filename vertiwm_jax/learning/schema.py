@@ -21,12 +21,16 @@ Numbers may be of any precision. Arrays of other names are not read. Maps lie in
 inside the collection or beside it.
 """
 
+import io
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from vertiwm_jax import runs
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.state import STEP_SECONDS
 
@@ -83,6 +87,41 @@ def read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise DataError(f"{path}: expected an .npz archive of plain arrays: {error}") from error
     arrays = check(path, arrays)
     return arrays, _parse(path, meta, "wheel_class" in arrays)
+
+
+def join(
+    drives: Sequence[Mapping[str, np.ndarray]], steps: int | None = None
+) -> dict[str, np.ndarray]:
+    """K drives as arrays of the schema, each filled up with its last values.
+
+    drives: by name, `[T + 1, ...]`, and "control" `[T, 2]`. steps: how long they become; by
+    default as long as the longest.
+    """
+    length = np.array([len(drive["control"]) for drive in drives], np.int32)
+    steps = int(length.max()) if steps is None else steps
+
+    def filled(name: str, array: np.ndarray) -> np.ndarray:
+        missing = steps + (name != "control") - len(array)
+        array = array.astype(np.float32) if name in _FLOATS else array
+        return np.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), "edge")
+
+    names = drives[0]
+    found = {name: np.stack([filled(name, drive[name]) for drive in drives]) for name in names}
+    return {**found, "length": length}
+
+
+def write(
+    path: Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], wheels: ArrayLike
+) -> None:
+    """Writes a file, whole or not at all.
+
+    meta: holds "map", the file name of the terrain map. wheels: `[4, 2]` x, y in the body, m.
+    """
+    vehicle = {"wheels_in_body_xy": np.asarray(wheels).tolist()}
+    text = json.dumps({**meta, "dt": STEP_SECONDS, "vehicle": vehicle})
+    stream = io.BytesIO()
+    np.savez_compressed(stream, allow_pickle=False, meta=np.array(text), **arrays)
+    runs.write_atomic(path, stream.getvalue())
 
 
 def check(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -1,9 +1,8 @@
 """Drives in a simulator, and the files that keep them."""
 
-import io
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -13,7 +12,6 @@ from vertiwm_jax.learning import schema
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.simulators.excitation import MARGIN, Pilot, within
 from vertiwm_jax.simulators.protocol import Observation, Simulator
-from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.map import TerrainMap
 
 LEAST_UPRIGHT = 0.3
@@ -62,39 +60,24 @@ def record(
     return Drive(observations, np.reshape(control, (-1, 2)), ending or "time")
 
 
-def archive(drives: Sequence[Drive], steps: int, meta: dict[str, Any], vehicle: Vehicle) -> bytes:
-    """A file of the schema with K drives of a vehicle, each filled up to `steps` with its last
-    values.
+def write(
+    path: Path, drives: Sequence[Drive], steps: int, meta: dict[str, Any], vehicle: Vehicle
+) -> None:
+    """A file of the schema with K drives of a vehicle, each filled up to `steps`.
 
-    meta: holds "map", the file name of the terrain map; the wheels are added.
+    meta: holds "map", the file name of the terrain map.
     """
-    columns = [_columns(drive, steps) for drive in drives]
-    wheels = {"wheels_in_body_xy": np.asarray(vehicle.wheel_position).tolist()}
-    stream = io.BytesIO()
-    np.savez_compressed(
-        stream,
-        allow_pickle=False,
-        length=np.array([len(drive.control) for drive in drives], np.int32),
-        ending=np.array([drive.ending for drive in drives]),
-        meta=np.array(json.dumps({**meta, "dt": STEP_SECONDS, "vehicle": wheels})),
-        **{name: np.stack([column[name] for column in columns]) for name in columns[0]},
-    )
-    return stream.getvalue()
+    arrays = schema.join([_arrays(drive) for drive in drives], steps)
+    arrays["ending"] = np.array([drive.ending for drive in drives])
+    schema.write(path, arrays, meta, vehicle.wheel_position)
 
 
-def _columns(drive: Drive, steps: int) -> dict[str, np.ndarray]:
+def _arrays(drive: Drive) -> dict[str, np.ndarray]:
     """Arrays of the schema `[T + 1, ...]`, of the control `[T, 2]`."""
     seen = jax.tree.map(lambda *x: np.stack(x), *drive.observations)
-    arrays = {"state": seen.state, "wheel_class": seen.wheel_class}
+    arrays = {"state": seen.state, "control": drive.control, "wheel_class": seen.wheel_class}
     known = {name: getattr(seen.auxiliary, name) for name in schema.AUXILIARY}
-    arrays |= {name: array for name, array in known.items() if array is not None}
-
-    def filled(array: np.ndarray, length: int) -> np.ndarray:
-        missing = [(0, length - len(array))] + [(0, 0)] * (array.ndim - 1)
-        return np.pad(array, missing, "edge")
-
-    columns = {name: filled(array, steps + 1) for name, array in arrays.items()}
-    return {**columns, "control": filled(drive.control.astype(np.float32), steps)}
+    return arrays | {name: array for name, array in known.items() if array is not None}
 
 
 def _ending(state: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ending | None:

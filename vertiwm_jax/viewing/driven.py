@@ -9,7 +9,7 @@ from vertiwm_jax.env.agent import Agent, Memory, Policy, Reactive
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason
-from vertiwm_jax.evaluation.wheels import modelled
+from vertiwm_jax.evaluation.prediction import modelled
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.viewing.scene import Scene
 

@@ -1,20 +1,16 @@
 """Recorded drives as scenes, with what a model predicts of them."""
 
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from vertiwm_jax.dynamics import Dynamics, History, Params
-from vertiwm_jax.evaluation import wheels
-from vertiwm_jax.evaluation.prediction import BATCH
-from vertiwm_jax.learning import dataset, windows
+from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.evaluation import prediction
+from vertiwm_jax.evaluation.prediction import TestWindows
+from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.dataset import Drives
-from vertiwm_jax.learning.rollouts import open_loop
 from vertiwm_jax.learning.schema import DataError
-from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.viewing.scene import Prediction, Scene
 
@@ -50,30 +46,12 @@ def load(path: Path, drive: int, name: str, dynamics: Dynamics, params: Params) 
 
 def predict(dynamics: Dynamics, params: Params, terrain: TerrainMap, drive: Drives) -> Prediction:
     """What the model predicts every 16 steps of one drive, D = 1, of 32 steps or more."""
-    index = windows.index(drive, terrain, STEPS, STEPS, STEPS)
-    shown = replace(windows.gather(drive, index), auxiliary=dataset.Auxiliary())
-    found = _predict(dynamics, params, terrain, shown)
-    states, alpha, depth = jax.device_get(found)
-    first = np.asarray(shown.state)[:, STEPS]
+    test = TestWindows.of(drive, terrain, STEPS, STEPS, STEPS)
+    states, read = prediction.predict(dynamics, params, test)
+    first = np.asarray(test.windows.state)[:, STEPS]
     return Prediction(
-        start=np.asarray(index.start) + STEPS,
-        state=np.concatenate([first[:, None], states], axis=1),
-        coefficients=alpha,
-        sinkage=depth,
+        start=STEPS * (1 + np.arange(len(test))),
+        state=np.concatenate([first[:, None], states.vector], axis=1),
+        coefficients=read.coefficients,
+        sinkage=read.wheels and np.asarray(read.wheels.wheel_sinkage),
     )
-
-
-def alpha_and_sinkage(history: History) -> tuple[jax.Array | None, dataset.Array | None]:
-    """`[4]` each, of a model that has them: fusion coefficients, and m of the wheels."""
-    modelled = wheels.modelled(history)
-    return getattr(history, "coefficients", None), modelled and modelled.wheel_sinkage
-
-
-@partial(jax.jit, static_argnames="dynamics")
-def _predict(dynamics: Dynamics, params: Params, terrain: TerrainMap, shown: Windows):
-    def one(window: Windows):
-        world = terrain.select(window.world)
-        states, read = open_loop(dynamics, params, world, window, alpha_and_sinkage)
-        return states.vector, *read
-
-    return jax.lax.map(one, shown, batch_size=BATCH)
