@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.classes import STANDARD
-from vertiwm_jax.terrain.map import MapError
+from vertiwm_jax.terrain.map import MapError, TerrainMap
 
 
 def build(**changes):
@@ -90,6 +91,21 @@ def test_friction_is_the_mean_of_the_class_unless_given():
 def test_a_map_is_centred_unless_told():
     terrain = build(elevation=np.ones((9, 17)), semantic=np.zeros((2, 4), int), resolution=0.5)
     np.testing.assert_allclose(terrain.origin, [-4, 2])
+    np.testing.assert_allclose(terrain.size, [8, 4])
+    np.testing.assert_allclose(terrain.extent, [[-4, -2], [4, 2]])
+
+
+def test_a_map_of_an_array_may_be_oblong_and_high_above_the_sea():
+    heights = 312 + np.add.outer(np.zeros(9), np.arange(17.0))
+    terrain = TerrainMap.from_array(heights, "sand", resolution=0.5, origin=(100.0, 50.0))
+    np.testing.assert_allclose(terrain.extent, [[100, 46], [108, 50]])
+    found = query.surface(terrain, jnp.array([101.0, 49.0]))
+    assert float(found.height) == 314 and terrain.class_names[int(found.semantic)] == "sand"
+    state = place(terrain)
+    np.testing.assert_allclose(state.position[:2], [104, 48])
+    assert 320 < float(state.position[2]) < 321 and float(state.rpy[1]) < -1
+    with pytest.raises(MapError, match=r"^map: classes: expected one of clay, .* found 'lava'"):
+        TerrainMap.from_array(heights, "lava")
 
 
 def test_stack_joins_worlds_and_pads_obstacles():

@@ -11,10 +11,8 @@ _VEHICLE, _GOAL = (0.80, 0.05, 0.05), (0.00, 0.25, 0.75)
 
 def extent(terrain: TerrainMap) -> tuple[float, float, float, float]:
     """West, east, south and north edge of the map, m."""
-    rows, columns = terrain.elevation.shape[-2:]
-    west, north = (float(x) for x in terrain.origin)
-    resolution = float(terrain.resolution)
-    return west, west + (columns - 1) * resolution, north - (rows - 1) * resolution, north
+    (west, south), (east, north) = np.asarray(terrain.extent).tolist()
+    return west, east, south, north
 
 
 def shaded(terrain: TerrainMap, world: int, enlarge: int = _PIXELS_A_VERTEX) -> np.ndarray:

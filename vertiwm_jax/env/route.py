@@ -187,8 +187,7 @@ def _window(padded: jax.Array, move: np.ndarray) -> jax.Array:
 
 def _cell_size(terrain: TerrainMap, cells: int) -> jax.Array:
     """`[2]` m along x and y."""
-    _, rows, columns = terrain.elevation.shape
-    return jnp.array([columns - 1, rows - 1]) * terrain.resolution / cells
+    return terrain.size / cells
 
 
 def _middles(terrain: TerrainMap, cells: int) -> jax.Array:

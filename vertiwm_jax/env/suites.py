@@ -93,8 +93,7 @@ def training_tasks(
 
 def test_tasks(config: GroundConfig, terrain: TerrainMap) -> Tasks:
     """Tasks across the circle of every world, 60 m in radius where the map is large enough."""
-    cells = min(terrain.elevation.shape[-2:]) - 1
-    half = cells * float(terrain.resolution) / 2
+    half = float(terrain.size.min()) / 2
     return circle_tasks(
         terrain, min(worlds.START_RADIUS, 15 / 16 * half), config.pairs, config.sway
     )

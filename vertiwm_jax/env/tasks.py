@@ -74,8 +74,7 @@ def circle_tasks(
     the circle to the most level start: on rough ground a vehicle often cannot leave a start at a
     fixed place. `ValueError` if the circle does not fit on the map.
     """
-    rows, columns = terrain.elevation.shape[-2:]
-    half = np.array([columns - 1, rows - 1]) * float(terrain.resolution) / 2
+    half = np.asarray(terrain.size) / 2
     if radius >= half.min():
         raise TaskError(
             f"circle_tasks: radius {radius:g} m does not fit on a map of "
@@ -146,10 +145,8 @@ def random_tasks(
 def _draw(
     key: jax.Array, terrain: TerrainMap, count: int, vehicle: Vehicle, config: RandomTaskConfig
 ) -> tuple[Tasks, jax.Array]:
-    rows, columns = terrain.elevation.shape[-2:]
-    extent = jnp.array([columns - 1, rows - 1]) * terrain.resolution
-    corner = terrain.origin - jnp.array([0.0, 1.0]) * extent
-    low, high = corner + config.margin, corner + extent - config.margin
+    low, high = terrain.extent
+    low, high = low + config.margin, high - config.margin
 
     def draw(inputs: tuple[jax.Array, jax.Array]) -> tuple[Tasks, jax.Array]:
         key, world = inputs

@@ -42,9 +42,6 @@ def is_terminal(ending: jax.Array) -> jax.Array:
 
 def edge_distance(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     """`[..., 2]` points to `[...]` m from the nearest edge of the map, negative outside."""
-    rows, columns = terrain.elevation.shape[-2:]
-    size = jnp.array([columns - 1, rows - 1]) * terrain.resolution
-    north_west = terrain.origin
     # Down from the northern edge, right from the western one.
-    inward = (xy - north_west) * jnp.array([1.0, -1.0])
-    return jnp.min(jnp.minimum(inward, size - inward), axis=-1)
+    inward = (xy - terrain.origin) * jnp.array([1.0, -1.0])
+    return jnp.min(jnp.minimum(inward, terrain.size - inward), axis=-1)

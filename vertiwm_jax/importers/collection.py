@@ -40,11 +40,9 @@ def write(
 
 def on_map(terrain: TerrainMap, drive: Drive) -> bool:
     """Whether the body origin stays within the heights of the map."""
-    rows, columns = terrain.elevation.shape[1:]
-    extent = float(terrain.resolution) * np.array([columns - 1, 1 - rows])
-    corners = np.sort([np.asarray(terrain.origin), np.asarray(terrain.origin) + extent], axis=0)
+    low, high = map(np.asarray, terrain.extent)
     xy = drive.state[:, :2]
-    return bool(((xy >= corners[0]) & (xy <= corners[1])).all())
+    return bool(((xy >= low) & (xy <= high)).all())
 
 
 def clearance(terrain: TerrainMap, drives: Sequence[Drive]) -> np.ndarray:

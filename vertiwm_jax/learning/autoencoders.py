@@ -166,9 +166,6 @@ def reconstruct(params: Params, seen: Patches) -> Patches:
 
 def _move(terrain: TerrainMap, position: jax.Array, offset: jax.Array) -> jax.Array:
     """A position `[3]` moved by `[2]` m on the map, as high above the ground as it was."""
-    rows, columns = terrain.elevation.shape[1:]
-    extent = terrain.resolution * jnp.array([columns - 1.0, 1.0 - rows])
-    corners = jnp.stack([terrain.origin, terrain.origin + extent])
-    xy = jnp.clip(position[:2] + offset, corners.min(axis=0), corners.max(axis=0))
+    xy = jnp.clip(position[:2] + offset, *terrain.extent)
     above = position[2] - query.height(terrain, position[:2])
     return jnp.append(xy, query.height(terrain, xy) + above)

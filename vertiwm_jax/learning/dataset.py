@@ -69,7 +69,7 @@ def load(folders: str | Path | Sequence[str | Path], split: Split) -> tuple[Driv
 
     Drives of unequal length are padded to the longest. Auxiliary arrays must be in all files or
     in none. Raises `DataError` on malformed drives, `MapError` on maps that are malformed or
-    differ in extent, classes or soils; both name the file.
+    differ in extent or classes; both name the file.
     """
     paths: list[Path] = []
     parts: list[dict[str, np.ndarray]] = []

@@ -143,9 +143,8 @@ def place(
     """
     sizes = hmmwv() if vehicle is None else vehicle
     if xy is None:
-        rows, columns = terrain.elevation.shape[-2:]
-        half = jnp.array([columns - 1, 1 - rows]) / 2 * terrain.resolution
-        xy = terrain.origin + half
+        low, high = terrain.extent
+        xy = (low + high) / 2
     position, rpy = rest_on_ground(
         terrain,
         jnp.asarray(xy, jnp.float32),

@@ -35,10 +35,8 @@ _NEAREST_GOAL = 20.0  # m
 
 def within(terrain: TerrainMap, margin: float) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest x, y `[2]` that are `margin` m from the edge, m."""
-    rows, columns = terrain.elevation.shape[-2:]
-    size = np.array([columns - 1, rows - 1]) * float(terrain.resolution)
-    north_west = np.asarray(terrain.origin)
-    return north_west + [margin, margin - size[1]], north_west + [size[0] - margin, -margin]
+    low, high = (np.asarray(corner, float) for corner in terrain.extent)
+    return low + margin, high - margin
 
 
 def start(rng: np.random.Generator, terrain: TerrainMap, seconds: float) -> tuple[float, ...]:

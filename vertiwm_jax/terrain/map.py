@@ -72,6 +72,18 @@ class TerrainMap:
         return self.elevation.shape[0]
 
     @property
+    def size(self) -> jax.Array:
+        """`[2]` m along x and along y."""
+        rows, columns = self.elevation.shape[-2:]
+        return self.resolution * jnp.array([columns - 1.0, rows - 1.0])
+
+    @property
+    def extent(self) -> tuple[jax.Array, jax.Array]:
+        """Lowest and highest x, y of the map, `[2]` m each."""
+        along, up = self.size * jnp.eye(2)
+        return self.origin - up, self.origin + along
+
+    @property
     def soil_set(self) -> jax.Array | int:
         """Which of the sets of soils the selected world has."""
         return self.world if len(self.soils.n) > 1 else 0
@@ -107,7 +119,7 @@ class TerrainMap:
             if classes not in STANDARD.names:
                 expected = f"one of {', '.join(STANDARD.names)}"
                 raise MapError(name, "classes", expected, repr(classes))
-            cells = (1, 1) if friction is None else np.shape(friction)
+            cells = np.shape(elevation if friction is None else friction)
             classes = np.full(cells, STANDARD.names.index(classes))
         return build(
             elevation,
@@ -338,10 +350,7 @@ def _check_obstacles(terrain: TerrainMap, name: str) -> None:
     _check(np.isfinite(obstacles), obstacles, name, "obstacles", expected)
     sizes = np.broadcast_to(obstacles[..., 2:].min(-1, keepdims=True), obstacles.shape)
     _check(sizes >= 0, obstacles, name, "obstacles", "sizes and heights >= 0")
-    rows, columns_ = terrain.elevation.shape[1:]
-    extent = np.array([columns_ - 1, rows - 1]) * float(terrain.resolution)
-    left_top = np.asarray(terrain.origin)
-    low, high = left_top - [0, extent[1]], left_top + [extent[0], 0]
+    low, high = map(np.asarray, terrain.extent)
     centre = obstacles[..., :2]
     unused = (obstacles == 0).all(-1, keepdims=True)
     inside = unused | ((centre >= low) & (centre <= high))

@@ -93,7 +93,5 @@ def _grid_coordinates(
 
 def _inside(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     """`[..., 2]` whether each coordinate is within the map's extent."""
-    _, rows, columns = terrain.elevation.shape
-    extent = terrain.resolution * jnp.array([columns - 1.0, rows - 1.0])
     from_corner = (xy - terrain.origin) * jnp.array([1.0, -1.0])
-    return (from_corner >= 0) & (from_corner <= extent)
+    return (from_corner >= 0) & (from_corner <= terrain.size)
