@@ -93,8 +93,8 @@ PUBLIC = {
         "vertiwm_jax.rl.td3.TD3Config",
         "vertiwm_jax.rl.mppi.MPPI",
         "vertiwm_jax.rl.shooting.Shooting",
-        "vertiwm_jax.evaluation.navigation.evaluate",
-        "vertiwm_jax.evaluation.navigation.NavigationResult",
+        "vertiwm_jax.env.episodes.run_episodes",
+        "vertiwm_jax.env.episodes.NavigationResult",
     ),
 }
 """What others may build on."""

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax.env.agent import Now
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import NavigationConfig, TaskParams
 from vertiwm_jax.env.tasks import Tasks
@@ -57,6 +58,12 @@ def bicycle_env(
     """A kinematic bicycle over `terrain`."""
     env = NavigationEnv(KinematicBicycle(), config or NavigationConfig())
     return env, env.make_params(BICYCLE, terrain, tasks)
+
+
+def begin(env: NavigationEnv, task: TaskParams, index: int = 0) -> Now:
+    """A start of the pool."""
+    observation, state = env.start(task, jnp.int32(index))
+    return Now(task, state, observation)
 
 
 def blocked(config: NavigationConfig) -> tuple[NavigationEnv, TaskParams]:

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from env.worlds import SNOW, hills
 
+from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason as Reason
-from vertiwm_jax.evaluation import external, navigation
+from vertiwm_jax.evaluation import external
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.simulators import processes
@@ -37,7 +38,7 @@ def test_the_built_in_simulator_outside_jit_is_that_inside(jobs):
     env = NavigationEnv(moves[0], config)
     params = env.make_params(moves[1], terrain, tasks)
     arguments = env, params, jax.tree_util.Partial(led_by_embedding), jax.random.key(0)
-    inside = navigation.evaluate(*arguments)
+    inside = run_episodes(*arguments)
     with processes.simulating(jobs) as mapped:
         found = external.evaluate(BuiltIn, mapped, tasks, *arguments)
     assert found.ending.tolist() == [

@@ -10,8 +10,10 @@ from flax import struct
 from scipy.stats import binomtest
 
 from vertiwm_jax import parallel
-from vertiwm_jax.env.agent import Agent
+from vertiwm_jax.env import episodes
+from vertiwm_jax.env.agent import Agent, Now
 from vertiwm_jax.env.controllers import RandomActions, StraightToGoal
+from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import TerminationReason
@@ -31,7 +33,7 @@ def short():
 
 @pytest.fixture(scope="module")
 def straight(short):
-    return navigation.evaluate(*short, StraightToGoal(CONFIG), jax.random.key(0))
+    return run_episodes(*short, StraightToGoal(CONFIG), jax.random.key(0))
 
 
 def test_agrees_with_a_loop_over_episodes(short, straight):
@@ -65,15 +67,15 @@ class Wandering(Agent):
 
     interval = 7
 
-    def start(self, params, state):
+    def init(self, now):
         return jnp.float32(0)
 
-    def decide(self, params, memory, observation, state, key):
-        jax.debug.callback(decided.append, state.time)
-        return 0.3 * memory + 0.3 * jax.random.normal(key) + 0.01 * state.vehicle.position[1]
+    def plan(self, now, memory, key):
+        jax.debug.callback(decided.append, now.state.time)
+        return 0.3 * memory + 0.3 * jax.random.normal(key) + 0.01 * now.state.vehicle.position[1]
 
-    def act(self, params, memory, observation, state, key):
-        return StraightToGoal(CONFIG)(observation, key).at[1].add(memory), memory
+    def act(self, now, memory, key):
+        return StraightToGoal(CONFIG)(now.observation, key).at[1].add(memory), memory
 
 
 decided = []
@@ -81,12 +83,12 @@ decided = []
 
 @pytest.mark.parametrize("together", [1, 4, 100])
 def test_decides_for_each_that_drives_as_if_it_were_alone(short, together, monkeypatch):
-    monkeypatch.setattr(navigation, "_TOGETHER", together)
+    monkeypatch.setattr(episodes, "_TOGETHER", together)
     jax.clear_caches()  # Or what was compiled for others together would be found.
     decided.clear()
     env, params = short
     wandering, key, interval = Wandering(), jax.random.key(3), Wandering.interval
-    found = jax.block_until_ready(navigation.evaluate(env, params, wandering, key))
+    found = jax.block_until_ready(run_episodes(env, params, wandering, key))
     jax.effects_barrier()
     assert len(set(found.steps.tolist())) > 2  # Some drive on where others have ended.
     # Nothing is decided where all that decide together have ended.
@@ -96,13 +98,13 @@ def test_decides_for_each_that_drives_as_if_it_were_alone(short, together, monke
     step, length = jax.jit(env.step_env), int(params.max_steps_in_episode)
     for task in range(params.pool_size):
         observation, state = env.start(params, task)
-        memory, time = wandering.start(params, state), 0
+        memory, time = jnp.float32(0), 0
         while state.ending == TerminationReason.RUNNING:
             if time % interval == 0:
                 deciding = jax.random.fold_in(jax.random.fold_in(key, length), time)
                 own = jax.random.split(deciding, params.pool_size)[task]
-                memory = wandering.decide(params, memory, observation, state, own)
-            action, memory = wandering.act(params, memory, observation, state, key)
+                memory = wandering.plan(Now(params, state, observation), memory, own)
+            action, memory = wandering.act(Now(params, state, observation), memory, key)
             observation, state, *_ = step(key, state, action, params)
             time += 1
         assert (found.ending[task], found.steps[task]) == (state.ending, time)
@@ -128,7 +130,7 @@ def test_summary_counts(straight):
 def test_time_runs_out_and_nobody_succeeds(short):
     env, params = short
     params = params.replace(max_steps_in_episode=jnp.int32(7))
-    result = navigation.evaluate(env, params, StraightToGoal(CONFIG), jax.random.key(0))
+    result = run_episodes(env, params, StraightToGoal(CONFIG), jax.random.key(0))
     assert (result.ending == TerminationReason.TIMED_OUT).all() and (result.steps == 7).all()
     row = navigation.Summary.of(result)
     assert row.successes == 0 and np.isnan(row.seconds)
@@ -146,7 +148,7 @@ def test_other_weights_do_not_compile_again(short):
 
     chex.clear_trace_counter()
     for weight in (0.0, 1.0):
-        navigation.evaluate(*short, Weighted(jnp.float32(weight)), jax.random.key(0))
+        run_episodes(*short, Weighted(jnp.float32(weight)), jax.random.key(0))
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 10), (6, 20), (18, 20), (100, 100)])

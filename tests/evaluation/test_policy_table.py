@@ -3,9 +3,9 @@ import json
 import jax.numpy as jnp
 import pytest
 
+from vertiwm_jax.env.episodes import NavigationResult
 from vertiwm_jax.env.termination import TerminationReason as Reason
 from vertiwm_jax.evaluation import policy_table
-from vertiwm_jax.evaluation.navigation import NavigationResult
 from vertiwm_jax.evaluation.policy_table import TrainingCost
 
 

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from vertiwm_jax.env.episodes import NavigationResult
 from vertiwm_jax.env.termination import TerminationReason as Reason
 from vertiwm_jax.evaluation import report
-from vertiwm_jax.evaluation.navigation import NavigationResult
 from vertiwm_jax.terrain import map as terrain_map
 
 SUITES = ["hard", "easy", "hard"]

@@ -8,9 +8,9 @@ from faults.border import fault
 from importers.bags import Bag
 
 from vertiwm_jax.env.controllers import StraightToGoal
+from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
-from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.importers import grid_map
 from vertiwm_jax.importers.settings import Frames, GridMapSettings
 from vertiwm_jax.terrain import files
@@ -45,7 +45,7 @@ def driven(terrain):
     """Where vehicles are, seen from their goals, and how their episodes end."""
     config = NavigationConfig(horizon_seconds=20.0)
     env, params = bicycle_env(terrain, circle_tasks(terrain, 20.0, pairs=2), config)
-    found = navigation.evaluate(env, params, StraightToGoal(config, speed=2.0), jax.random.key(0))
+    found = run_episodes(env, params, StraightToGoal(config, speed=2.0), jax.random.key(0))
     return np.asarray(found.position - found.goal[:, None]), np.asarray(found.success)
 
 

@@ -18,9 +18,10 @@ from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.learning.dataset import Auxiliary
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.simulators import chrono, excitation, recording
+from vertiwm_jax.simulators import chrono, collection, excitation
+from vertiwm_jax.simulators.driving import Drive
 from vertiwm_jax.simulators.protocol import Observation, SimulatorError
-from vertiwm_jax.terrain import files
+from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.reveal import RevealConfig
 from vertiwm_jax.world_model import choice
@@ -80,7 +81,7 @@ def test_drives_are_read_as_recorded(collected, maps):
 
 
 def test_going_on_is_as_if_never_stopped(collected, maps, tmp_path, monkeypatch, capsys):
-    write, left = recording.write, []
+    write, left = collection.write, []
 
     def stopping(path, drives, steps, meta, vehicle):
         if meta["world"] == 1:
@@ -89,7 +90,7 @@ def test_going_on_is_as_if_never_stopped(collected, maps, tmp_path, monkeypatch,
         write(path, drives, steps, meta, vehicle)
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as stop:
-        patch.setattr(recording, "write", stopping)
+        patch.setattr(collection, "write", stopping)
         run(maps, tmp_path / "drives")
     assert stop.value.code == 130
     assert sorted(left) == ["config.yaml", "maps", "world_000.npz"]
@@ -151,9 +152,9 @@ def test_drives_that_end_early_are_tried_again(maps, monkeypatch):
 
     def short(simulator, terrain, start, pilot, steps):
         tried.append(start)
-        return recording.Drive([], np.zeros((next(lengths), 2)), "rolled over")
+        return Drive([], np.zeros((next(lengths), 2)), "rolled over")
 
-    monkeypatch.setattr(recording, "record", short)
+    monkeypatch.setattr(collection, "record", short)
     command = collect.Collect(output=maps, seconds=1.0)
     task = collect.Task(command, hmmwv(), None, files.load(maps), world=0, drive=0)
     assert len(collect.record(task).control) == 3 and len(set(tried)) == 6
@@ -190,11 +191,11 @@ def test_endings(maps, tmp_path, index, value, ending, length):
     states[3:, index] = value
     level = files.load(maps / "map_0.npz")
     pilot = excitation.sinusoids(np.random.default_rng(0), 5, 0.3725)
-    drive = recording.record(Scripted(states), level, (0, 0, 0), pilot, 5)
+    drive = collection.record(Scripted(states), level, (0, 0, 0), pilot, 5)
     assert (drive.ending, len(drive.control), len(drive.observations)) == (
         ending, length, length + 1,
     )  # fmt: skip
-    recording.write(tmp_path / "a.npz", [drive], 5, {"map": "a"}, hmmwv())
+    collection.write(tmp_path / "a.npz", [drive], 5, {"map": "a"}, hmmwv())
     file = np.load(tmp_path / "a.npz")
     assert file["length"] == [length] and file["state"].shape == (1, 6, 12)
     assert json.loads(str(file["meta"]))["dt"] == 0.1
@@ -231,17 +232,27 @@ class AtGoal:
         return jnp.stack([0.0 * observation[8], observation[10]])
 
 
+class Ahead:
+    """Draws goals 30 m to the east of the middle of the map."""
+
+    @staticmethod
+    def uniform(low, high, shape):
+        return np.broadcast_to([30.0, 0.0], shape)
+
+
 @pytest.mark.parametrize("eyes", [None, choice.eyes()], ids=["arcs", "embeddings"])
 def test_a_policy_drives_from_goal_to_goal(maps, eyes):
-    terrain, config = files.load(maps / "map_0.npz"), NavigationConfig(speed_range=(0.0, 5.0))
+    terrain = files.load(maps / "map_0.npz")
+    config = NavigationConfig(speed_range=(0.0, 5.0), embeddings=eyes is not None)
     size = OBSERVATION_SIZE + (math.prod(EMBEDDING_SHAPE) if eyes else 0)
     policy = jax.tree_util.Partial(AtGoal(size))
-    pilot = excitation.Learned(policy, config, eyes, terrain, np.random.default_rng(0), hmmwv())
-    state, goals = np.zeros(12, np.float32), []
+    rng = np.random.default_rng(0)
+    pilot = collection.to_goals(policy, config, eyes, hmmwv(), terrain, (0.0, 0.0, 0.0), rng)
+    height = float(query.height(terrain, jnp.zeros(2)))
+    state, goals = np.array([0, 0, height, *np.zeros(9)], np.float32), []
     for _ in range(3):
         command = pilot(state)
-        goal = pilot._goal
-        assert goal is not None
+        goal = np.asarray(pilot.state.goal)
         goals.append(goal)
         offset = goal - state[:3]
         bearing = np.arctan2(offset[1], offset[0]) - state[5]
@@ -266,14 +277,13 @@ def test_a_policy_sees_as_far_as_it_did_in_training():
         lambda seen, key: jnp.stack([seen[heights].mean(), seen[way.start] / 10])
     )
     state = np.array([0, 0, 0.5, *np.zeros(9)], np.float32)
-    goal, standing = np.array([30.0, 0.0, 0.0]), np.array([-1.0, 0.0])
     acted = {}
     for sight in (12.0, np.inf):
         config = NavigationConfig(reveal=RevealConfig(range=sight))
-        routes = excitation._route(config, terrain, hmmwv(), goal[:2])
-        known = config, hmmwv(), policy, None, terrain, None, routes
-        belief, acted[sight], _ = excitation._act(*known, state, goal, standing)
-        assert (belief is None) == np.isinf(sight)
+        pilot = collection.to_goals(policy, config, None, hmmwv(), terrain, state[[0, 1, 5]], Ahead)
+        pilot(state)
+        assert (pilot.state.belief is None) == np.isinf(sight)
+        acted[sight] = np.asarray(pilot._action)
     assert acted[np.inf][0] - acted[12.0][0] > 0.05
     # Of two who look at the same hills one knows that the way up costs more than its length.
     assert acted[np.inf][1] > 0.01 > abs(acted[12.0][1])

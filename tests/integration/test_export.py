@@ -20,9 +20,9 @@ from vertiwm_jax.deploy import onnx_graph, run_policy, stablehlo
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.controllers import LookAhead, StraightToGoal
+from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.networks.policy import Actor, Senses, SquashedActor
 from vertiwm_jax.rl.experiment import SACTraining
@@ -99,7 +99,7 @@ def written(policy, folder):
 
 @jax.jit
 def act(policy, seen):
-    """As `navigation.evaluate` asks a policy, weights as arguments."""
+    """As `run_episodes` asks a policy, weights as arguments."""
     return policy(seen, jax.random.key(1))
 
 
@@ -162,8 +162,8 @@ def test_the_robot_drives_as_the_test_does(tmp_path):
     config = NavigationConfig(speed_range=CONFIG.speed_range, horizon_seconds=4.0)
     env, params = bicycle_env(terrain, task((-20.0, 0.0), (20.0, 5.0)), config)
     key = jax.random.key(0)
-    expected = navigation.evaluate(env, params, policy, key)
-    found = navigation.evaluate(env, params, Robot(written(policy, tmp_path)[1]), key)
+    expected = run_episodes(env, params, policy, key)
+    found = run_episodes(env, params, Robot(written(policy, tmp_path)[1]), key)
     assert expected.driven[0] > 3
     np.testing.assert_allclose(found.position, expected.position, atol=1e-3)
 

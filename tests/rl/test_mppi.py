@@ -5,14 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from env import worlds
-from env.worlds import BICYCLE, ground, task
+from env.worlds import BICYCLE, begin, ground, task
 
 from vertiwm_jax.env import route
+from vertiwm_jax.env.agent import Now
 from vertiwm_jax.env.controllers import StraightToGoal
+from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
-from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
 from vertiwm_jax.terrain.reveal import RevealConfig
@@ -46,18 +47,18 @@ def driver(env, **config):
 
 def decided(env, params, driver, start=0, corrections=None):
     """What is intended at a start, once decided with `KEY`, `[D, 2]`."""
-    observation, state = env.start(params, jnp.int32(start))
-    memory = driver.start(params, state)
+    now = begin(env, params, start)
+    memory = driver.init(now)
     if corrections is not None:
         memory = replace(memory, corrections=corrections)
-    return jax.jit(driver.decide)(params, memory, observation, state, KEY).corrections
+    return jax.jit(driver.plan)(now, memory, KEY).corrections
 
 
 def test_it_drives_around_what_driving_straight_runs_into(blocked):
     env, params = blocked
-    straight = navigation.evaluate(env, params, StraightToGoal(CONFIG), KEY)
+    straight = run_episodes(env, params, StraightToGoal(CONFIG), KEY)
     assert (straight.ending == TerminationReason.COLLIDED).all()
-    found = navigation.evaluate(env, params, driver(env), KEY)
+    found = run_episodes(env, params, driver(env), KEY)
     assert (found.ending == TerminationReason.GOAL).all()
 
 
@@ -73,7 +74,7 @@ def test_it_plans_in_what_it_has_seen_of_the_map():
     np.testing.assert_array_equal(*intended[seeing])
     assert not np.allclose(*intended[CONFIG])
     env, params = worlds.blocked(seeing)
-    found = navigation.evaluate(env, params, driver(env), KEY)
+    found = run_episodes(env, params, driver(env), KEY)
     assert (found.ending == TerminationReason.GOAL).all()
 
 
@@ -82,13 +83,14 @@ def test_the_model_follows_the_vehicle():
     env = NavigationEnv(Pulling(), replace(CONFIG, settle_steps=0))
     params = env.make_params(BICYCLE, ground(), task((-20.0, 0.0), (20.0, 0.0)))
     pulled = driver(env)
-    assert navigation.evaluate(env, params, pulled, KEY).ending[0] == TerminationReason.GOAL
-    observation, state = env.start(params, jnp.int32(0))
-    memory = pulled.start(params, state)
+    assert run_episodes(env, params, pulled, KEY).ending[0] == TerminationReason.GOAL
+    now = begin(env, params)
+    memory = pulled.init(now)
     act, step = jax.jit(pulled.act), jax.jit(env.step_env)
     for _ in range(5):
-        action, memory = act(params, memory, observation, state, KEY)
-        observation, state, *_ = step(KEY, state, action, params)
+        action, memory = act(now, memory, KEY)
+        observation, state, *_ = step(KEY, now.state, action, params)
+        now = Now(params, state, observation)
     assert int(memory.history) == int(state.history) == 5
 
 
@@ -103,12 +105,11 @@ def test_a_plan_without_alternatives_is_kept_and_moves_on(blocked):
 def test_plans_count_by_what_they_return(blocked, temperature):
     env, params = blocked
     planner = driver(env, temperature=temperature)
-    observation, state = env.start(params, jnp.int32(0))
     noise_key, key = jax.random.split(KEY)
     noise = jax.random.normal(noise_key, (16, 4, 2)).at[0].set(0.0)
     plans = jnp.clip(0.5 * noise, -1.0, 1.0)
-    imagine = jax.jit(jax.vmap(planner.imagine, (None, None, None, 0, None)))
-    returns = np.asarray(imagine(params, observation, state, plans, key), float)
+    imagine = jax.jit(jax.vmap(planner.imagine, (None, 0, None)))
+    returns = np.asarray(imagine(begin(env, params), plans, key), float)
     weights = np.exp((returns - returns.max()) / temperature)
     expected = np.tensordot(weights / weights.sum(), plans, axes=1)
     if temperature < 1:
@@ -135,10 +136,14 @@ def test_after_a_plan_it_goes_on_to_the_goal_at_a_steady_pace(blocked):
 def test_many_decide_as_each_alone(blocked):
     env, params = blocked
     planner = driver(env)
-    observations, states = jax.vmap(env.start, (None, 0))(params, jnp.arange(2))
-    memories = jax.vmap(planner.start, (None, 0))(params, states)
-    decide = jax.jit(jax.vmap(planner.decide, (None, 0, 0, 0, None)))
-    together = decide(params, memories, observations, states, KEY).corrections
+
+    @jax.jit
+    @jax.vmap
+    def plan(start):
+        now = begin(env, params, start)
+        return planner.plan(now, planner.init(now), KEY).corrections
+
+    together = plan(jnp.arange(2))
     for i in range(2):
         np.testing.assert_allclose(together[i], decided(env, params, planner, i), atol=1e-3)
 

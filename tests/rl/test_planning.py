@@ -4,15 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from env.worlds import BICYCLE, bicycle_env, ground, task
+from env.worlds import BICYCLE, begin, bicycle_env, ground, task
 from flax import struct
 
 from vertiwm_jax.env.action_repeat import ActionRepeat
+from vertiwm_jax.env.agent import Now
 from vertiwm_jax.env.controllers import StraightToGoal
+from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
-from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.rl.learned import Corrected
@@ -56,9 +57,9 @@ def test_without_alternatives_it_drives_as_the_policy_does(blocked):
     env, params = blocked
     for correction in ((0.0, 0.0), (0.1, 0.2)):
         alone = planner(env, correction, candidates=1, decisions=1)
-        found = navigation.evaluate(env, params, alone, KEY)
+        found = run_episodes(env, params, alone, KEY)
         held = Corrected(StraightToGoal(CONFIG), Always(jnp.array(correction)))
-        expected = navigation.evaluate(env, params, held, KEY)
+        expected = run_episodes(env, params, held, KEY)
         assert int(found.ending[0]) == int(expected.ending[0])
         np.testing.assert_allclose(found.path(0)[0], expected.path(0)[0], atol=1e-3)
 
@@ -68,7 +69,7 @@ def test_it_drives_around_what_its_policy_runs_into(blocked):
 
     def ending(**config):
         ahead = planner(env, (0.3, 0.0), base=False, spread=0.6, **config)
-        return navigation.evaluate(env, params, ahead, KEY).ending[0]
+        return run_episodes(env, params, ahead, KEY).ending[0]
 
     assert ending(candidates=1) == TerminationReason.COLLIDED
     assert ending(candidates=16, decisions=4) == TerminationReason.GOAL
@@ -77,14 +78,14 @@ def test_it_drives_around_what_its_policy_runs_into(blocked):
 def test_a_future_is_worth_its_rewards_and_what_is_expected_at_its_end(blocked):
     env, params = blocked
     driver = planner(env, correction=(0.1, -0.3), value=7.0, decisions=3)
-    observation, state = env.start(params, jnp.int32(0))
-    first = jnp.array([0.2, 0.3])
-    found = jax.jit(driver.imagine)(params, observation, state, first, KEY)
+    now, first = begin(env, params), jnp.array([0.2, 0.3])
+    found = jax.jit(driver.imagine)(now, first, KEY)
     repeated, total, actions = (
         ActionRepeat(env, 8, driver.base),
         0.0,
-        [first] + [driver.policy(observation)] * 2,
+        [first] + [driver.policy(now.observation)] * 2,
     )
+    state = now.state
     for i, action in enumerate(actions):
         _, state, reward, *_ = jax.jit(repeated.step_env)(KEY, state, action, params)
         total += 0.9**i * float(reward)
@@ -94,7 +95,8 @@ def test_a_future_is_worth_its_rewards_and_what_is_expected_at_its_end(blocked):
 @pytest.mark.parametrize("ending", [TerminationReason.COLLIDED, TerminationReason.TIMED_OUT])
 def test_nothing_is_expected_after_the_end(blocked, ending):
     env, params = blocked
-    observation, state = env.start(params, jnp.int32(0))
+    now = begin(env, params)
+    state = now.state
     near = {"position": state.vehicle.position.at[0].set(-5.0)}
     if ending == TerminationReason.TIMED_OUT:
         params = params.replace(max_steps_in_episode=jnp.int32(3))
@@ -103,7 +105,7 @@ def test_nothing_is_expected_after_the_end(blocked, ending):
     returns = [
         float(
             planner(env, value=value, decisions=4).imagine(
-                params, observation, state, jnp.array([1.0, 0.0]), KEY
+                Now(params, state, now.observation), jnp.array([1.0, 0.0]), KEY
             )
         )
         for value in (0.0, 1e6)
@@ -118,12 +120,13 @@ def test_its_model_follows_the_vehicle():
     tasks = task((-20.0, 0.0), (20.0, 0.0))
     env_params = env.make_params(params, ground(), tasks)
     driver = replace(planner(env, candidates=2, decisions=1), dynamics=params)
-    observation, state = env.start(env_params, jnp.int32(0))
-    memory = driver.start(env_params, state)
+    now = begin(env, env_params)
+    memory = driver.init(now)
     act, step = jax.jit(driver.act), jax.jit(env.step_env)
     for _ in range(15):
-        action, memory = act(env_params, memory, observation, state, KEY)
-        observation, state, *_ = step(KEY, state, action, env_params)
+        action, memory = act(now, memory, KEY)
+        observation, state, *_ = step(KEY, now.state, action, env_params)
+        now = Now(env_params, state, observation)
     assert state.history.wheel_speed.min() > 2
     np.testing.assert_allclose(memory.history.wheel_speed, state.history.wheel_speed, atol=0.05)
     np.testing.assert_allclose(memory.history.travel, state.history.travel, atol=0.005)

@@ -7,10 +7,10 @@ import pytest
 from env import worlds
 from env.worlds import BICYCLE, bicycle_env, ground, hills, task
 
+from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
-from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.rl.shooting import Shooting, ShootingConfig
 
@@ -44,11 +44,11 @@ def driver(env, **config):
 
 
 def started(env, params, driver, corrections=None, start=0):
-    observation, state = env.start(params, jnp.int32(start))
-    memory = driver.start(params, state)
+    now = worlds.begin(env, params, start)
+    memory = driver.init(now)
     if corrections is not None:
         memory = replace(memory, corrections=corrections)
-    return memory, observation, state
+    return now, memory
 
 
 def drawn(number, decisions=4, key=KEY):
@@ -57,21 +57,19 @@ def drawn(number, decisions=4, key=KEY):
 
 def test_it_drives_around_what_driving_straight_runs_into(blocked):
     env, params = blocked
-    found = navigation.evaluate(env, params, driver(env), KEY)
+    found = run_episodes(env, params, driver(env), KEY)
     assert (found.ending == TerminationReason.GOAL).all()
 
 
 def test_the_gradient_is_that_of_finite_differences(hilly):
     env, params = hilly
     planner = driver(env)
-    _, _, state = started(env, params, planner)
+    now, _ = started(env, params, planner)
     smooth = jax.jit(planner.smooth_return)
     plan, nudge = drawn(1)[0], 1e-3
-    found = jax.jit(jax.grad(planner.smooth_return, argnums=2))(params, state, plan)
+    found = jax.jit(jax.grad(planner.smooth_return, argnums=1))(now, plan)
     for place in np.ndindex(plan.shape):
-        above, below = (
-            float(smooth(params, state, plan.at[place].add(sign * nudge))) for sign in (1, -1)
-        )
+        above, below = (float(smooth(now, plan.at[place].add(sign * nudge))) for sign in (1, -1))
         difference = (above - below) / (2 * nudge)
         assert float(found[place]) == pytest.approx(difference, rel=0.03, abs=2.0)
 
@@ -79,14 +77,14 @@ def test_the_gradient_is_that_of_finite_differences(hilly):
 def test_steps_improve_what_a_plan_returns_smoothly(hilly):
     env, params = hilly
     planner = driver(env, steps=4, rate=0.05)
-    memory, _, state = started(env, params, planner)
-    worth = jax.jit(jax.vmap(planner.smooth_return, (None, None, 0)))
+    now, memory = started(env, params, planner)
+    worth = jax.jit(jax.vmap(planner.smooth_return, (None, 0)))
     improve = jax.jit(planner.improve)
     plans = drawn(16)
     for _ in range(2):
-        better = improve(params, memory, state, plans)
+        better = improve(now, memory, plans)
         assert float(jnp.max(jnp.abs(better))) <= 1.0
-        assert (worth(params, state, better) > worth(params, state, plans)).all()
+        assert (worth(now, better) > worth(now, plans)).all()
         plans = better
 
 
@@ -100,8 +98,8 @@ def test_a_step_turns_a_plan_away_from_a_rock_that_it_passes_too_near():
     plan = jnp.tile(jnp.array([0.3, 0.0]), (3, 1))
 
     def steered(params):
-        _, _, state = started(env, params, planner)
-        return float(jax.jit(jax.grad(planner.smooth_return, argnums=2))(params, state, plan)[0, 1])
+        now, _ = started(env, params, planner)
+        return float(jax.jit(jax.grad(planner.smooth_return, argnums=1))(now, plan)[0, 1])
 
     assert steered(params) > abs(steered(free)) + 10
 
@@ -111,10 +109,10 @@ def test_a_sharp_smooth_return_is_the_task_s(blocked, speed):
     """At 1 the plan runs into the wall, at 0.3 it stops short of it."""
     env, params = blocked
     sharp = driver(env, clearance=1e-3, leeway=1e-3, discount=0.9999)
-    _, observation, state = started(env, params, sharp)
+    now, _ = started(env, params, sharp)
     plan = jnp.tile(jnp.array([speed, 0.0]), (4, 1))
-    found = jax.jit(sharp.smooth_return)(params, state, plan)
-    expected = jax.jit(sharp.imagine)(params, observation, state, plan, KEY)
+    found = jax.jit(sharp.smooth_return)(now, plan)
+    expected = jax.jit(sharp.imagine)(now, plan, KEY)
     assert (float(expected) < 500) == (speed == 1.0)
     assert float(found) == pytest.approx(float(expected), rel=2e-3)
 
@@ -122,11 +120,11 @@ def test_a_sharp_smooth_return_is_the_task_s(blocked, speed):
 def test_what_it_intends_is_worth_more_than_any_plan_it_drew(blocked):
     env, params = blocked
     planner = driver(env)
-    memory, observation, state = started(env, params, planner, drawn(1)[0])
+    now, memory = started(env, params, planner, drawn(1)[0])
     noise = jax.random.normal(KEY, (8, 4, 2)).at[0].set(0.0)
     plans = jnp.clip(planner.intended(memory) + 0.5 * noise, -1.0, 1.0)
-    decided = jax.jit(planner.decide)(params, memory, observation, state, KEY).corrections
-    worth = jax.jit(planner.worth)(params, memory, state, jnp.concatenate([plans, decided[None]]))
+    decided = jax.jit(planner.plan)(now, memory, KEY).corrections
+    worth = jax.jit(planner.worth)(now, memory, jnp.concatenate([plans, decided[None]]))
     assert float(worth[-1]) > float(worth[:-1].max()) + 1.0
 
 
@@ -134,8 +132,8 @@ def test_a_plan_without_alternatives_is_kept_and_moves_on(blocked):
     env, params = blocked
     plan = jnp.array([[0.1, 0.2], [0.3, -0.4], [0.5, 0.6], [-0.7, 0.8]])
     alone = driver(env, candidates=1, improved=1, steps=0)
-    memory, observation, state = started(env, params, alone, plan)
-    found = jax.jit(alone.decide)(params, memory, observation, state, KEY).corrections
+    now, memory = started(env, params, alone, plan)
+    found = jax.jit(alone.plan)(now, memory, KEY).corrections
     np.testing.assert_allclose(found, plan[jnp.array([1, 2, 3, 3])], rtol=1e-6)
 
 
@@ -143,9 +141,9 @@ def test_a_gradient_that_is_not_finite_leaves_its_plan_and_no_other():
     env = NavigationEnv(Broken(), replace(CONFIG, settle_steps=0))
     params = env.make_params(BICYCLE, ground(), task((-20.0, 0.0), (20.0, 0.0)))
     planner = driver(env)
-    memory, _, state = started(env, params, planner)
+    now, memory = started(env, params, planner)
     plans = jnp.array([[[0.2, 0.1]] * 4, [[0.2, -0.1]] * 4])
-    found = jax.jit(planner.improve)(params, memory, state, plans)
+    found = jax.jit(planner.improve)(now, memory, plans)
     assert not np.allclose(found[0], plans[0]) and np.isfinite(found).all()
     np.testing.assert_array_equal(found[1], plans[1])
 
@@ -155,15 +153,15 @@ def test_it_compiles_once(blocked):
     planner, traces = driver(env), []
 
     @jax.jit
-    def decide(driver, *arguments):
+    def plan(driver, *arguments):
         traces.append(1)
-        return driver.decide(*arguments)
+        return driver.plan(*arguments)
 
     for start in (0, 1):
-        memory, observation, state = started(env, params, planner, start=start)
+        now, memory = started(env, params, planner, start=start)
         key = jax.random.key(start)
-        memory = decide(planner, params, memory, observation, state, key)
-        decide(planner, params, memory, observation, state, key)
+        memory = plan(planner, now, memory, key)
+        plan(planner, now, memory, key)
     assert len(traces) == 1
 
 

@@ -3,8 +3,8 @@ import numpy as np
 from env.worlds import bicycle_env, ground, hills, task
 
 from vertiwm_jax.env.controllers import StraightToGoal
+from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.viewing import driven
 
 
@@ -13,7 +13,7 @@ def test_a_policy_drives_as_it_is_judged():
     env, params = bicycle_env(ground(hills()), task((-20.0, 0.0), (20.0, 5.0)), config)
     policy, key = StraightToGoal(config), jax.random.key(0)
     scene = driven.drive(env, params, policy, key, "straight")
-    position, rpy = navigation.evaluate(env, params, policy, key).path(0)
+    position, rpy = run_episodes(env, params, policy, key).path(0)
     assert 50 < scene.steps < 200
     assert scene.title == f"straight: goal, {scene.steps / 10:.1f} s"
     np.testing.assert_allclose(scene.state[:, :3], position, atol=1e-3)

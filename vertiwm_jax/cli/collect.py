@@ -21,11 +21,11 @@ from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.runs import Progress
-from vertiwm_jax.simulators import chrono, excitation, processes, recording
+from vertiwm_jax.simulators import chrono, collection, excitation, processes
 from vertiwm_jax.simulators.builtin import BuiltIn
 from vertiwm_jax.simulators.chrono import Chrono
+from vertiwm_jax.simulators.driving import Drive
 from vertiwm_jax.simulators.protocol import SimulatorError
-from vertiwm_jax.simulators.recording import Drive
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import files, worlds
 from vertiwm_jax.terrain.map import TerrainMap
@@ -147,10 +147,10 @@ def record(task: Task) -> Drive:
         rng = np.random.default_rng([command.seed, task.world, task.drive, attempt])
         start = excitation.start(rng, terrain, command.seconds)
         if task.learned:
-            pilot = excitation.Learned(*task.learned, terrain, rng, task.vehicle)
+            pilot = collection.to_goals(*task.learned, task.vehicle, terrain, start, rng)
         else:
             pilot = excitation.sinusoids(rng, command.steps, float(task.vehicle.steering_limit))
-        tries.append(recording.record(simulator, terrain, start, pilot, command.steps))
+        tries.append(collection.record(simulator, terrain, start, pilot, command.steps))
         if len(tries[-1].control) >= SHORTEST * command.steps:
             break
     longest = max(tries, key=lambda drive: len(drive.control))
@@ -215,4 +215,4 @@ def _write(
         "world": world,
         "seed": command.seed,
     }
-    recording.write(path, drives, command.steps, meta, vehicle.vehicle)
+    collection.write(path, drives, command.steps, meta, vehicle.vehicle)

@@ -14,10 +14,10 @@ from vertiwm_jax.config import AtLeastOne, ConfigError, Count
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.controllers import REFERENCE
+from vertiwm_jax.env.episodes import NavigationResult
 from vertiwm_jax.env.suites import SUITES, GroundConfig, Suite
 from vertiwm_jax.evaluation import external, policy_table, report
 from vertiwm_jax.evaluation.external import Arena
-from vertiwm_jax.evaluation.navigation import NavigationResult
 from vertiwm_jax.evaluation.policy_table import TrainingCost
 from vertiwm_jax.evaluation.report import Results
 from vertiwm_jax.rl import experiment

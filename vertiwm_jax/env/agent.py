@@ -1,4 +1,4 @@
-"""What drives a vehicle through its task: functions of an observation, and those that remember."""
+"""What drives a vehicle through its task: functions of an observation, and agents that remember."""
 
 from abc import ABC, abstractmethod
 from typing import Any, Protocol
@@ -21,56 +21,50 @@ class Policy(Protocol):
     def __call__(self, observation: jax.Array, key: jax.Array) -> jax.Array: ...
 
 
-class Agent(ABC):
-    """Decides every `interval` steps and acts at each, and carries a memory of its own.
+@struct.dataclass
+class Now:
+    """One episode at the moment of a decision.
 
-    A pytree, like a `Policy`; `interval` is static. It sees the state that the task is in, which
-    its methods get of one episode; the parameters are those of the environment that it drives in,
-    of whose terrain it may know what `params.believed(state)` gives.
+    task: what the environment is run with; of its terrain an agent may know what
+        `task.believed(state)` gives. observation: `[O]`.
+    """
+
+    task: TaskParams
+    state: TaskState
+    observation: jax.Array
+
+
+class Agent(ABC):
+    """Plans every `interval` steps and acts at each, and carries a memory of its own.
+
+    A pytree, like a `Policy`; `interval` is static. Its methods are of one episode.
     """
 
     interval = 1
 
-    def start(self, params: TaskParams, state: TaskState) -> Memory:
-        """The memory at the beginning of an episode; none, by default."""
+    def init(self, now: Now) -> Memory:
+        """The memory at the beginning of an episode; none by default."""
         return None
 
-    def decide(
-        self,
-        params: TaskParams,
-        memory: Memory,
-        observation: jax.Array,
-        state: TaskState,
-        key: jax.Array,
-    ) -> Memory:
-        """The memory with what is intended for the next `interval` steps; by default as it is."""
+    def plan(self, now: Now, memory: Memory, key: jax.Array) -> Memory:
+        """The memory with a plan for the next `interval` steps; as it is by default."""
         return memory
 
     @abstractmethod
-    def act(
-        self,
-        params: TaskParams,
-        memory: Memory,
-        observation: jax.Array,
-        state: TaskState,
-        key: jax.Array,
-    ) -> tuple[jax.Array, Memory]:
+    def act(self, now: Now, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
         """A `[2]` action in [-1, 1], and the memory after it."""
 
 
 @struct.dataclass
 class Reactive(Agent):
-    """A policy as a driver: it acts on what it sees, and remembers nothing."""
+    """A policy as an agent: it acts on what it sees, and remembers nothing."""
 
     policy: Policy
 
-    def act(
-        self,
-        params: TaskParams,
-        memory: None,
-        observation: jax.Array,
-        state: TaskState,
-        key: jax.Array,
-    ) -> tuple[jax.Array, None]:
-        """What the policy says."""
-        return self.policy(observation, key), None
+    def act(self, now: Now, memory: None, key: jax.Array) -> tuple[jax.Array, None]:
+        return self.policy(now.observation, key), None
+
+
+def as_agent(driver: Policy | Agent) -> Agent:
+    """A policy made an agent; an agent as it is."""
+    return driver if isinstance(driver, Agent) else Reactive(driver)

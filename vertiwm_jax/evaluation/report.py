@@ -16,16 +16,12 @@ from vertiwm_jax import machine, runs
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.controllers import REFERENCE
+from vertiwm_jax.env.episodes import NavigationResult, run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import TaskParams
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation import plots
-from vertiwm_jax.evaluation.navigation import (
-    NavigationResult,
-    Summary,
-    evaluate,
-    format_table,
-)
+from vertiwm_jax.evaluation.navigation import Summary, format_table
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import Trained
 from vertiwm_jax.state import STEP_SECONDS
@@ -70,7 +66,7 @@ def drive(
     params: TaskParams,
     policies: Mapping[str, Policy | Agent],
     key: jax.Array,
-    judge: Judge = evaluate,
+    judge: Judge = run_episodes,
 ) -> dict[str, Results]:
     """Drives all tasks of the pool with each policy; the results by suite."""
     _log.info("driving %d tasks on %d worlds ...", params.pool_size, params.terrain.worlds)

@@ -10,7 +10,7 @@ from flax import struct
 
 from vertiwm_jax.dynamics import History, Params, step
 from vertiwm_jax.env.action_repeat import ActionRepeat, corrected
-from vertiwm_jax.env.agent import Agent
+from vertiwm_jax.env.agent import Agent, Now
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import TaskParams, TaskState
 
@@ -42,9 +42,9 @@ class Future:
     total: jax.Array
 
     @classmethod
-    def of(cls, observation: jax.Array, state: TaskState) -> Self:
+    def of(cls, now: Now) -> Self:
         """Nothing is imagined yet."""
-        return cls(observation, state, jnp.float32(1), jnp.float32(0))
+        return cls(now.observation, now.state, jnp.float32(1), jnp.float32(0))
 
 
 def around(usual: jax.Array, number: int, spread: float, key: jax.Array) -> jax.Array:
@@ -71,67 +71,44 @@ class Imagining(Agent):
     env: NavigationEnv = struct.field(pytree_node=False)
     dynamics: Params
 
-    def start(self, params: TaskParams, state: TaskState) -> Plan:
+    def init(self, now: Now) -> Plan:
         """The model's first history, and no correction."""
-        terrain = params.believed(state)
-        history = self.env.dynamics.init(self.dynamics, terrain, state.vehicle)
+        terrain = now.task.believed(now.state)
+        history = self.env.dynamics.init(self.dynamics, terrain, now.state.vehicle)
         return Plan(history, jnp.zeros((self.planned, 2)))
 
-    def act(
-        self,
-        params: TaskParams,
-        memory: Plan,
-        observation: jax.Array,
-        state: TaskState,
-        key: jax.Array,
-    ) -> tuple[jax.Array, Plan]:
+    def act(self, now: Now, memory: Plan, key: jax.Array) -> tuple[jax.Array, Plan]:
         """The base, corrected as planned; the model's history follows the vehicle."""
-        action = corrected(self.base, observation, key, memory.corrections[0])
-        terrain = params.believed(state)
-        command = params.vehicle.command(action, self.env.config.speed_range)
-        given = self.dynamics, terrain, memory.history, state.vehicle, command
+        action = corrected(self.base, now.observation, key, memory.corrections[0])
+        terrain = now.task.believed(now.state)
+        command = now.task.vehicle.command(action, self.env.config.speed_range)
+        given = self.dynamics, terrain, memory.history, now.state.vehicle, command
         _, history = step(self.env.dynamics, *given)
         return action, replace(memory, history=history)
 
     @abstractmethod
-    def imagine(
-        self,
-        params: TaskParams,
-        observation: jax.Array,
-        state: TaskState,
-        candidate: jax.Array,
-        key: jax.Array,
-    ) -> jax.Array:
-        """The discounted return `[]` of a candidate, in the task inside the model."""
+    def imagine(self, now: Now, candidate: jax.Array, key: jax.Array) -> jax.Array:
+        """The discounted return `[]` of a candidate; `now` is inside the model."""
 
-    def returns(
-        self,
-        params: TaskParams,
-        memory: Plan,
-        observation: jax.Array,
-        state: TaskState,
-        candidates: jax.Array,
-        key: jax.Array,
-    ) -> jax.Array:
+    def returns(self, now: Now, memory: Plan, candidates: jax.Array, key: jax.Array) -> jax.Array:
         """`[N]` what candidates `[N, ...]` would return from where the vehicle is."""
-        params, state = self.inside(params, memory, state)
-        each = jax.vmap(self.imagine, (None, None, None, 0, None))
-        return each(params, observation, state, candidates, key)
+        each = jax.vmap(self.imagine, (None, 0, None))
+        return each(self.inside(now, memory), candidates, key)
 
-    def inside(
-        self, params: TaskParams, memory: Plan, state: TaskState
-    ) -> tuple[TaskParams, TaskState]:
+    def inside(self, now: Now, memory: Plan) -> Now:
         """The task as it is now, inside the model; what is believed of the map is true there."""
-        params = replace(params, dynamics=self.dynamics, terrain=params.believed(state))
-        return params, replace(state, history=memory.history, belief=None)
+        terrain = now.task.believed(now.state)
+        task = replace(now.task, dynamics=self.dynamics, terrain=terrain)
+        state = replace(now.state, history=memory.history, belief=None)
+        return replace(now, task=task, state=state)
 
     def hold(
-        self, params: TaskParams, future: Future, correction: jax.Array, key: jax.Array
+        self, task: TaskParams, future: Future, correction: jax.Array, key: jax.Array
     ) -> Future:
         """What one more decision `[2]` leads to, in the task inside the model."""
         env = ActionRepeat(self.env, self.interval, self.base)
-        observation, state, reward, ended, _ = env.step_env(key, future.state, correction, params)
+        observation, state, reward, ended, _ = env.step_env(key, future.state, correction, task)
         total = future.total + future.weight * reward
-        ended = ended | env.is_truncated(state, params)
+        ended = ended | env.is_truncated(state, task)
         weight = jnp.where(ended, 0.0, future.weight * self.discount)
         return Future(observation, state, weight, total)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.config import Positive, settings
-from vertiwm_jax.env.task import TaskParams, TaskState
+from vertiwm_jax.env.agent import Now
 from vertiwm_jax.rl.imagining import Plan, around
 from vertiwm_jax.rl.open_loop import OpenLoop, OpenLoopConfig
 
@@ -32,18 +32,11 @@ class MPPI(OpenLoop):
 
     config: MPPIConfig = struct.field(pytree_node=False, default=MPPIConfig())
 
-    def decide(
-        self,
-        params: TaskParams,
-        memory: Plan,
-        observation: jax.Array,
-        state: TaskState,
-        key: jax.Array,
-    ) -> Plan:
+    def plan(self, now: Now, memory: Plan, key: jax.Array) -> Plan:
         """The plans' mean."""
         noise_key, key = jax.random.split(key)
         config = self.config
         candidates = around(self.intended(memory), config.candidates, config.spread, noise_key)
-        returns = self.returns(params, memory, observation, state, candidates, key)
+        returns = self.returns(now, memory, candidates, key)
         weights = jax.nn.softmax(returns / config.temperature)
         return replace(memory, corrections=jnp.tensordot(weights, candidates, axes=1))

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.config import Count, Discount, NotNegative, Positive, settings
+from vertiwm_jax.env.agent import Now
 from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.rl.imagining import Future, Imagining, Plan
 from vertiwm_jax.state import STEP_SECONDS
@@ -60,27 +61,20 @@ class OpenLoop(Imagining):
         """`[D, 2]` the plan moved on by a decision; after the last one it is the same again."""
         return jnp.concatenate([memory.corrections[1:], memory.corrections[-1:]])
 
-    def imagine(
-        self,
-        params: TaskParams,
-        observation: jax.Array,
-        state: TaskState,
-        candidate: jax.Array,
-        key: jax.Array,
-    ) -> jax.Array:
+    def imagine(self, now: Now, candidate: jax.Array, key: jax.Array) -> jax.Array:
         """The discounted return `[]` of a plan `[D, 2]` and of what is expected after it."""
 
         def advance(future: Future, inputs: tuple[jax.Array, jax.Array]) -> tuple[Future, None]:
-            return self.hold(params, future, *inputs), None
+            return self.hold(now.task, future, *inputs), None
 
         keys = jax.random.split(key, self.config.decisions)
-        future, _ = jax.lax.scan(advance, Future.of(observation, state), (candidate, keys))
-        return future.total + future.weight * self.expected(params, future.state)
+        future, _ = jax.lax.scan(advance, Future.of(now), (candidate, keys))
+        return future.total + future.weight * self.expected(now.task, future.state)
 
-    def expected(self, params: TaskParams, state: TaskState) -> jax.Array:
+    def expected(self, task: TaskParams, state: TaskState) -> jax.Array:
         """The discounted return `[]` of going on by the route to the goal, at a steady pace."""
         reward, discount = self.env.config.reward, self.config.discount
-        left = jnp.maximum(params.cost_to_go(state) - self.env.config.goal_radius, 0.0)
+        left = jnp.maximum(task.cost_to_go(state) - self.env.config.goal_radius, 0.0)
         stride = self.config.pace * self.config.interval * STEP_SECONDS
         at_goal = discount ** (left / stride)
         on_the_way = reward.progress * stride * (1 - at_goal) / (1 - discount)

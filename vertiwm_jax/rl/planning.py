@@ -8,7 +8,7 @@ from flax import struct
 
 from vertiwm_jax.config import Count, NotNegative, settings
 from vertiwm_jax.env.action_repeat import Controller
-from vertiwm_jax.env.task import TaskParams, TaskState
+from vertiwm_jax.env.agent import Now
 from vertiwm_jax.rl.imagining import Future, Imagining, Plan, around
 from vertiwm_jax.rl.learned import MeanAction, TwinValue, Value
 from vertiwm_jax.world_model.choice import ModelName
@@ -46,37 +46,23 @@ class Planner(Imagining):
     discount: float = struct.field(pytree_node=False)
     config: PlanningConfig = struct.field(pytree_node=False, default=PlanningConfig())
 
-    def decide(
-        self,
-        params: TaskParams,
-        memory: Plan,
-        observation: jax.Array,
-        state: TaskState,
-        key: jax.Array,
-    ) -> Plan:
+    def plan(self, now: Now, memory: Plan, key: jax.Array) -> Plan:
         """The first action of the best imagined future."""
         noise_key, key = jax.random.split(key)
-        usual = self.policy(observation)
+        usual = self.policy(now.observation)
         candidates = around(usual, self.config.candidates, self.config.spread, noise_key)
-        returns = self.returns(params, memory, observation, state, candidates, key)
+        returns = self.returns(now, memory, candidates, key)
         return replace(memory, corrections=candidates[jnp.argmax(returns)][None])
 
-    def imagine(
-        self,
-        params: TaskParams,
-        observation: jax.Array,
-        state: TaskState,
-        candidate: jax.Array,
-        key: jax.Array,
-    ) -> jax.Array:
+    def imagine(self, now: Now, candidate: jax.Array, key: jax.Array) -> jax.Array:
         """The discounted return `[]` of one action and of what the policy makes of it."""
 
         def advance(
             carry: tuple[Future, jax.Array], key: jax.Array
         ) -> tuple[tuple[Future, jax.Array], None]:
-            future = self.hold(params, *carry, key)
+            future = self.hold(now.task, *carry, key)
             return (future, self.policy(future.observation)), None
 
         keys = jax.random.split(key, self.config.decisions)
-        (future, _), _ = jax.lax.scan(advance, (Future.of(observation, state), candidate), keys)
+        (future, _), _ = jax.lax.scan(advance, (Future.of(now), candidate), keys)
         return future.total + future.weight * self.value(future.observation)

@@ -9,9 +9,10 @@ import optax
 from flax import struct
 
 from vertiwm_jax.config import Count, CountOrZero, Positive, settings
+from vertiwm_jax.env.agent import Now
 from vertiwm_jax.env.observation import distance_and_bearing
 from vertiwm_jax.env.reward import ending_reward
-from vertiwm_jax.env.task import TaskParams, TaskState
+from vertiwm_jax.env.task import TaskState
 from vertiwm_jax.env.termination import TerminationReason, edge_distance
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.rl.imagining import Plan, around
@@ -61,44 +62,32 @@ class Shooting(OpenLoop):
 
     config: ShootingConfig = struct.field(pytree_node=False, default=ShootingConfig())
 
-    def decide(
-        self,
-        params: TaskParams,
-        memory: Plan,
-        observation: jax.Array,
-        state: TaskState,
-        key: jax.Array,
-    ) -> Plan:
+    def plan(self, now: Now, memory: Plan, key: jax.Array) -> Plan:
         """The best plan."""
         config = self.config
         drawn = around(self.intended(memory), config.candidates, config.spread, key)
-        worth = self.worth(params, memory, state, drawn)
+        worth = self.worth(now, memory, drawn)
         best = drawn[jax.lax.top_k(worth, config.improved)[1]]
-        plans = jnp.concatenate([best, self.improve(params, memory, state, best)])
-        chosen = jnp.argmax(self.worth(params, memory, state, plans))
+        plans = jnp.concatenate([best, self.improve(now, memory, best)])
+        chosen = jnp.argmax(self.worth(now, memory, plans))
         return replace(memory, corrections=plans[chosen])
 
-    def worth(
-        self, params: TaskParams, memory: Plan, state: TaskState, plans: jax.Array
-    ) -> jax.Array:
+    def worth(self, now: Now, memory: Plan, plans: jax.Array) -> jax.Array:
         """`[N]` the `smooth_return` of plans `[N, D, 2]` from where the vehicle is."""
-        params, state = self.inside(params, memory, state)
-        return jax.vmap(self.smooth_return, (None, None, 0))(params, state, plans)
+        return jax.vmap(self.smooth_return, (None, 0))(self.inside(now, memory), plans)
 
-    def improve(
-        self, params: TaskParams, memory: Plan, state: TaskState, plans: jax.Array
-    ) -> jax.Array:
+    def improve(self, now: Now, memory: Plan, plans: jax.Array) -> jax.Array:
         """`[N, D, 2]` plans, each after `steps` of Adam up the gradient of its `smooth_return`.
 
         Plans stay within [-1, 1], and as they are where a gradient is not finite.
         """
-        params, state = self.inside(params, memory, state)
+        now = self.inside(now, memory)
         optimiser = optax.adam(self.config.rate)
-        slope = jax.vmap(jax.grad(self.smooth_return, argnums=2), (None, None, 0))
+        slope = jax.vmap(jax.grad(self.smooth_return, argnums=1), (None, 0))
 
         def ascend(carry: tuple[jax.Array, optax.OptState], _: None) -> tuple[tuple, None]:
             plans, memory = carry
-            gradient = slope(params, state, plans)
+            gradient = slope(now, plans)
             usable = jnp.all(jnp.isfinite(gradient), axis=(1, 2), keepdims=True)
             updates, memory = optimiser.update(jnp.where(usable, -gradient, 0.0), memory)
             return (jnp.clip(plans + cast(jax.Array, updates), -1.0, 1.0), memory), None
@@ -106,34 +95,34 @@ class Shooting(OpenLoop):
         carry = plans, optimiser.init(plans)
         return jax.lax.scan(ascend, carry, length=self.config.steps)[0][0]
 
-    def smooth_return(self, params: TaskParams, state: TaskState, plan: jax.Array) -> jax.Array:
+    def smooth_return(self, now: Now, plan: jax.Array) -> jax.Array:
         """`[]` like the return of a plan `[D, 2]`, but endings come by degrees.
 
         Where the task ends, at a distance or at an angle, an episode goes on here with a weight
         that a sigmoid lets sink, and the ending's reward counts by what was lost: whoever nears a
         rock feels it before the two touch. Standing still has no gradient.
         """
-        env, reward = self.env, self.env.config.reward
+        env, reward, task = self.env, self.env.config.reward, now.task
         discount = self.config.discount ** (1 / self.config.interval)
-        terrain = params.terrain.select(state.world)
+        terrain = task.terrain.select(now.state.world)
 
         def advance(carry: tuple, action: jax.Array) -> tuple[tuple, None]:
             before, weight, total = carry
             # Nothing in a step is random; what it observes is not computed.
-            _, after, gain, _, _ = env.step_env(jax.random.key(0), before, action, params)
+            _, after, gain, _, _ = env.step_env(jax.random.key(0), before, action, task)
             distance, _ = distance_and_bearing(after.vehicle.position, after.goal)
             ended = ending_reward(reward, after.ending, distance)
             gain = gain - jnp.where(before.ending == TerminationReason.RUNNING, ended, 0.0)
             remains = jnp.float32(1)
-            for ending, share in self._nearness(terrain, params.vehicle, after, distance).items():
+            for ending, share in self._nearness(terrain, task.vehicle, after, distance).items():
                 gain = gain + share * ending_reward(reward, jnp.int32(ending), distance)
                 remains = remains * (1 - share)
             return (after, weight * discount * remains, total + weight * gain), None
 
         actions = jnp.repeat(plan, self.config.interval, axis=0)
-        start = state, jnp.float32(1), jnp.float32(0)
+        start = now.state, jnp.float32(1), jnp.float32(0)
         (end, weight, total), _ = jax.lax.scan(advance, start, actions)
-        return total + weight * self.expected(params, end)
+        return total + weight * self.expected(task, end)
 
     def _nearness(
         self, terrain: TerrainMap, vehicle: Vehicle, state: TaskState, distance: jax.Array

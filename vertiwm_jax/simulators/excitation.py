@@ -1,27 +1,16 @@
-"""Where recorded drives start, and what commands them."""
+"""Where recorded drives start and go to, and the paper's commands."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.env import observation
-from vertiwm_jax.env.agent import Policy
-from vertiwm_jax.env.route import Routes
-from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import edge_distance
-from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.simulators.protocol import SimulatorError
-from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
-from vertiwm_jax.terrain import query, reveal
-from vertiwm_jax.terrain.belief import MapBelief
+from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.perception import Eyes
-
-Pilot = Callable[[np.ndarray], np.ndarray]
-"""State `[12]` to the command `[2]` of the next step: speed, m/s, and front-wheel angle, rad."""
 
 MARGIN = 3.0
 """m from the edge of the map at which a drive ends; starts and goals keep 2 m more."""
@@ -66,7 +55,9 @@ def start(rng: np.random.Generator, terrain: TerrainMap, seconds: float) -> tupl
     )
 
 
-def sinusoids(rng: np.random.Generator, steps: int, full_lock: float) -> Pilot:
+def sinusoids(
+    rng: np.random.Generator, steps: int, full_lock: float
+) -> Callable[[np.ndarray], np.ndarray]:
     """The paper's commands: speed at 0.1 to 2.5 Hz between bounds that are drawn from 1 to 2 and 3
     to 4 m/s, steering at 0.1 to 0.5 Hz with an amplitude of 0.2 to 1 of `full_lock`, rad."""
     time = STEP_SECONDS * np.arange(steps)
@@ -82,87 +73,12 @@ def sinusoids(rng: np.random.Generator, steps: int, full_lock: float) -> Pilot:
     return lambda state: next(commands)
 
 
-@dataclass
-class Learned:
-    """Follows a policy from goal to goal; the next is drawn where one is reached.
-
-    eyes: of a policy that sees embeddings of the ground.
-    """
-
-    policy: Policy
-    config: NavigationConfig
-    eyes: Eyes | None
-    terrain: TerrainMap
-    rng: np.random.Generator
-    vehicle: Vehicle
-
-    def __post_init__(self) -> None:
-        standing = Command(jnp.float32(0), jnp.float32(0))
-        self._action = np.asarray(self.vehicle.action(standing, self.config.speed_range))
-        self._goal: np.ndarray | None = None
-        self._routes: Routes | None = None
-        self._belief: MapBelief | None = None
-
-    def __call__(self, state: np.ndarray) -> np.ndarray:
-        """The policy's command at the state `[12]`."""
-        goal = self._goal
-        if goal is None or np.linalg.norm(goal - state[:3]) < self.config.goal_radius:
-            self._goal = goal = self._draw_goal(state[:2])
-            self._routes = _route(self.config, self.terrain, self.vehicle, goal[:2])
-        own = (
-            self.config,
-            self.vehicle,
-            self.policy,
-            self.eyes,
-            self.terrain,
-            self._belief,
-            self._routes,
-        )
-        self._belief, self._action, command = jax.device_get(_act(*own, state, goal, self._action))
-        return command
-
-    def _draw_goal(self, xy: np.ndarray) -> np.ndarray:
-        """`[3]` m, on the ground anywhere on the map but near by."""
-        places = self.rng.uniform(*within(self.terrain, MARGIN + 2), (64, 2)).astype(np.float32)
-        distance = np.linalg.norm(places - xy, axis=-1)
-        place = places[np.argmax(np.minimum(distance, _NEAREST_GOAL))]
-        return np.append(place, np.asarray(query.height(self.terrain, jnp.asarray(place))))
-
-
-@jax.jit(static_argnames="config")
-def _route(
-    config: NavigationConfig, terrain: TerrainMap, vehicle: Vehicle, goal: jax.Array
-) -> Routes:
-    return config.route_to(terrain, vehicle, goal)
-
-
-@jax.jit(static_argnames="config")
-def _act(
-    config: NavigationConfig,
-    driven: Vehicle,
-    policy: Policy,
-    eyes: Eyes | None,
-    terrain: TerrainMap,
-    belief: MapBelief | None,
-    routes: Routes,
-    state: jax.Array,
-    goal: jax.Array,
-    action: jax.Array,
-) -> tuple[MapBelief | None, jax.Array, jax.Array]:
-    """What is known of the map, the next action `[2]` and the command `[2]` that it stands for."""
-    vehicle = VehicleState.from_vector(state)
-    pose = vehicle.position, vehicle.rpy[2]
-    if belief is None:
-        belief = reveal.begin(config.reveal, terrain, *pose)
-    else:
-        belief = reveal.look(config.reveal, terrain, belief, *pose)
-    terrain = replace(terrain, belief=belief)
-    seen = observation.observe(terrain, driven, vehicle, goal, routes, action)
-    if eyes:
-        seen = observation.with_embedding(seen, eyes(terrain, vehicle).latent)
-    # No learned policy is random.
-    action = jnp.clip(policy(seen, jax.random.key(0)), -1.0, 1.0)
-    return belief, action, driven.command(action, config.speed_range).vector
+def next_goal(rng: np.random.Generator, terrain: TerrainMap, xy: np.ndarray) -> np.ndarray:
+    """`[3]` m, on the ground of the selected world, anywhere on the map but near `[2]` xy."""
+    places = rng.uniform(*within(terrain, MARGIN + 2), (64, 2)).astype(np.float32)
+    distance = np.linalg.norm(places - xy, axis=-1)
+    place = places[np.argmax(np.minimum(distance, _NEAREST_GOAL))]
+    return np.append(place, np.asarray(query.height(terrain, jnp.asarray(place))))
 
 
 @jax.jit

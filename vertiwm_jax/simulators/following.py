@@ -1,6 +1,6 @@
-"""The navigation task of a vehicle that a simulator outside jit moves."""
+"""The navigation task of a vehicle that a simulator outside jit moves, and agents that drive it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -8,8 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax.env.agent import Agent, Memory, Now
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.task import TaskParams, TaskState
+from vertiwm_jax.env.route import Routes
+from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState
+from vertiwm_jax.env.termination import TerminationReason
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
@@ -42,10 +46,80 @@ def followed(env: NavigationEnv) -> NavigationEnv:
     return replace(env, dynamics=Followed())
 
 
+class AgentPilot:
+    """An agent that commands a vehicle in a simulator outside jit, see `driving.drive`.
+
+    state: of the task, as it goes on; path: position and roll, pitch, yaw `[6]` of all its states.
+    """
+
+    def __init__(
+        self,
+        env: NavigationEnv,
+        task: TaskParams,
+        agent: Agent,
+        start: TaskState,
+        key: jax.Array,
+        next_goal: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> None:
+        """`AgentPilot` of one episode, or of a drive from goal to goal.
+
+        Args:
+            env: the task, as `followed` gives it.
+            task: what it is run with.
+            agent: what drives.
+            start: a start of the pool, whose vehicle is replaced by the one that is seen.
+            key: of all that is random.
+            next_goal: draws the goal `[3]`, m, that follows one that is reached at `[2]` x, y, m.
+                Without it the drive ends with the episode.
+        """
+        self.state, self.path = start, list[np.ndarray]()
+        self._env, self._task, self._agent, self._key = env, task, agent, key
+        self._next_goal = next_goal
+        self._memory: Memory = None
+        self._action: jax.Array | None = None
+
+    def __call__(self, seen: np.ndarray) -> np.ndarray | None:
+        """The command `[2]` at the state `[12]` that the vehicle is in; None once all is over."""
+        env, vehicle = self._env, jnp.asarray(seen)
+        task = moved(self._task, vehicle)
+        step, first = len(self.path), self._action is None
+        plan_key, act_key = jax.random.split(jax.random.fold_in(self._key, step))
+        if first:
+            now = _begin(env, task, self.state, vehicle)
+        else:
+            now = _follow(env, task, self.state, self._action, act_key)
+        if self._next_goal:
+            now = self._from_goal_to_goal(now, self._next_goal)
+        self.state = now.state
+        self.path.append(np.concatenate([now.state.vehicle.position, now.state.vehicle.rpy]))
+        if now.state.ending != TerminationReason.RUNNING:
+            return None
+        if first:
+            self._memory = _init(self._agent, now)
+        if step % self._agent.interval == 0:
+            self._memory = _plan(self._agent, now, self._memory, plan_key)
+        action, self._memory = _act(self._agent, now, self._memory, act_key)
+        self._action = action
+        return _command(env, task, action)
+
+    def _from_goal_to_goal(self, now: Now, draw: Callable[[np.ndarray], np.ndarray]) -> Now:
+        """The same, as if the episode had begun here, with another goal where one is reached."""
+        zero, config = jnp.int32(0), self._env.config
+        state = replace(now.state, ending=zero, stalled=zero, time=zero)
+        place = np.asarray(state.vehicle.position)
+        if np.linalg.norm(state.goal - place) >= config.goal_radius:
+            return replace(now, state=state)
+        goal = jnp.asarray(draw(place[:2]), jnp.float32)
+        routes = _route(config, now.task.terrain.select(state.world), now.task.vehicle, goal[:2])
+        self._task = replace(self._task, routes=routes)
+        task, state = replace(now.task, routes=routes), replace(state, goal=goal, route=zero)
+        return Now(task, state, _observe(self._env, task, state))
+
+
 def start(
     simulator: Simulator,
     env: NavigationEnv,
-    params: TaskParams,
+    task: TaskParams,
     state: TaskState,
     pose: Sequence[float],
 ) -> tuple[jax.Array, TaskState]:
@@ -54,29 +128,69 @@ def start(
     state: a start of the pool, whose vehicle is replaced; pose: `[3]` x, y, m, and yaw, rad.
     """
     seen = jnp.asarray(simulator.start(*pose).state)
-    return _begin(env, _moved(params, seen), state, seen)
+    now = _begin(env, moved(task, seen), state, seen)
+    return now.observation, now.state
 
 
 def move(
-    simulator: Simulator, env: NavigationEnv, params: TaskParams, action: jax.Array
+    simulator: Simulator, env: NavigationEnv, task: TaskParams, action: jax.Array
 ) -> TaskParams:
     """Does the action `[2]` in `simulator`; `Followed` does the same with these parameters."""
-    seen = simulator.step(np.asarray(params.vehicle.command(action, env.config.speed_range).vector))
-    return _moved(params, jnp.asarray(seen.state))
+    return moved(task, jnp.asarray(simulator.step(_command(env, task, action)).state))
 
 
-def _moved(params: TaskParams, state: jax.Array) -> TaskParams:
-    dynamics = params.dynamics
+def moved(task: TaskParams, state: jax.Array) -> TaskParams:
+    """Parameters by which `Followed` moves the vehicle to a state `[12]`."""
+    dynamics = task.dynamics
     if isinstance(dynamics, SightedParams):
-        return replace(params, dynamics=replace(dynamics, dynamics=state))
-    return replace(params, dynamics=state)
+        return replace(task, dynamics=replace(dynamics, dynamics=state))
+    return replace(task, dynamics=state)
 
 
 @partial(jax.jit, static_argnames="env")
-def _begin(
-    env: NavigationEnv, params: TaskParams, state: TaskState, seen: jax.Array
-) -> tuple[jax.Array, TaskState]:
-    vehicle, terrain = VehicleState.from_vector(seen), params.terrain.select(state.world)
-    history = env.dynamics.init(params.dynamics, terrain, vehicle)
+def _begin(env: NavigationEnv, task: TaskParams, state: TaskState, seen: jax.Array) -> Now:
+    vehicle, terrain = VehicleState.from_vector(seen), task.terrain.select(state.world)
+    history = env.dynamics.init(task.dynamics, terrain, vehicle)
     state = replace(state, vehicle=vehicle, history=history)
-    return env.observe(None, state, None, params), state
+    return Now(task, state, env.observe(None, state, None, task))
+
+
+@partial(jax.jit, static_argnames="env")
+def _follow(
+    env: NavigationEnv, task: TaskParams, state: TaskState, action: jax.Array, key: jax.Array
+) -> Now:
+    """The task after the vehicle has moved."""
+    observation, state, *_ = env.step_env(key, state, action, task)
+    return Now(task, state, observation)
+
+
+@partial(jax.jit, static_argnames="env")
+def _observe(env: NavigationEnv, task: TaskParams, state: TaskState) -> jax.Array:
+    return env.observe(None, state, None, task)
+
+
+@partial(jax.jit, static_argnames="config")
+def _route(
+    config: NavigationConfig, terrain: TerrainMap, vehicle: Vehicle, goal: jax.Array
+) -> Routes:
+    return config.route_to(terrain, vehicle, goal)
+
+
+@jax.jit
+def _init(agent: Agent, now: Now) -> Memory:
+    return agent.init(now)
+
+
+@jax.jit
+def _plan(agent: Agent, now: Now, memory: Memory, key: jax.Array) -> Memory:
+    return agent.plan(now, memory, key)
+
+
+@jax.jit
+def _act(agent: Agent, now: Now, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
+    action, memory = agent.act(now, memory, key)
+    return jnp.clip(action, -1.0, 1.0), memory
+
+
+def _command(env: NavigationEnv, task: TaskParams, action: jax.Array) -> np.ndarray:
+    return np.asarray(task.vehicle.command(action, env.config.speed_range).vector)
