@@ -15,6 +15,7 @@ from typing import Any
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
+import vertiwm_jax
 from vertiwm_jax import config as configuration_files
 from vertiwm_jax.cli.collect import Collect
 from vertiwm_jax.cli.compare import CompareConfig
@@ -41,63 +42,43 @@ COMMANDS = {
 
 PACKAGE = "vertiwm_jax"
 PUBLIC = {
-    "State and motion": (
-        "vertiwm_jax.state.VehicleState",
-        "vertiwm_jax.state.Command",
-        "vertiwm_jax.dynamics.Dynamics",
-        "vertiwm_jax.dynamics.rollout",
-        "vertiwm_jax.mechanics.kinematic.place",
-    ),
+    "State and motion": ("VehicleState", "Command", "Dynamics", "rollout", "place"),
     "Ground": (
-        "vertiwm_jax.terrain.map.TerrainMap",
-        "vertiwm_jax.terrain.map.build",
-        "vertiwm_jax.terrain.map.stack",
-        "vertiwm_jax.terrain.files.load_map",
-        "vertiwm_jax.terrain.files.from_heightmap",
-        "vertiwm_jax.terrain.files.save",
-        "vertiwm_jax.terrain.worlds.make_worlds",
-        "vertiwm_jax.terrain.worlds.generate",
-        "vertiwm_jax.terrain.worlds.WorldConfig",
-        "vertiwm_jax.terrain.classes.GroundClasses",
-        "vertiwm_jax.terrain.soil.Soil",
+        "TerrainMap",
+        "load_map",
+        "make_worlds",
+        "terrain.files.from_heightmap",
+        "terrain.files.save",
+        "terrain.map.build",
+        "terrain.map.stack",
+        "terrain.worlds.WorldConfig",
+        "terrain.classes.GroundClasses",
+        "terrain.soil.Soil",
     ),
-    "Vehicles and models": (
-        "vertiwm_jax.mechanics.vehicle.Vehicle",
-        "vertiwm_jax.mechanics.vehicle.load_vehicle",
-        "vertiwm_jax.mechanics.vehicle.load",
-        "vertiwm_jax.world_model.choice.load_model",
-        "vertiwm_jax.world_model.model.VertiWM",
-    ),
+    "Vehicles and models": ("Vehicle", "load_vehicle", "load_model"),
     "Recorded drives": (
-        "vertiwm_jax.learning.dataset.load_drives",
-        "vertiwm_jax.learning.dataset.Drives",
-        "vertiwm_jax.learning.pipeline.fit",
-        "vertiwm_jax.evaluation.prediction.predict",
-        "vertiwm_jax.adaptation.soil_filter.SoilFilter",
+        "load_drives",
+        "learning.dataset.Drives",
+        "prediction_errors",
+        "adaptation.soil_filter.SoilFilter",
     ),
     "The task": (
-        "vertiwm_jax.env.navigation.NavigationEnv",
-        "vertiwm_jax.env.task.NavigationConfig",
-        "vertiwm_jax.env.task.TaskParams",
-        "vertiwm_jax.env.reward.RewardConfig",
-        "vertiwm_jax.env.termination.TerminationReason",
-        "vertiwm_jax.env.tasks.circle_tasks",
-        "vertiwm_jax.env.tasks.random_tasks",
-        "vertiwm_jax.env.gymnasium.NavigationGymEnv",
+        "make_env",
+        "NavigationEnv",
+        "env.task.NavigationConfig",
+        "env.task.TaskParams",
+        "env.reward.RewardConfig",
+        "env.termination.TerminationReason",
+        "env.gymnasium.NavigationGymEnv",
     ),
     "Policies and planners": (
-        "vertiwm_jax.env.agent.Agent",
-        "vertiwm_jax.rl.ppo.PPO",
-        "vertiwm_jax.rl.ppo.PPOConfig",
-        "vertiwm_jax.rl.sac.SACConfig",
-        "vertiwm_jax.rl.td3.TD3Config",
-        "vertiwm_jax.rl.mppi.MPPI",
-        "vertiwm_jax.rl.shooting.Shooting",
-        "vertiwm_jax.env.episodes.run_episodes",
-        "vertiwm_jax.env.episodes.NavigationResult",
+        "Agent",
+        "MPPI",
+        "env.episodes.run_episodes",
+        "env.episodes.NavigationResult",
     ),
 }
-"""What others may build on."""
+"""What others may build on: names of the package, and a few inside it."""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -142,22 +123,27 @@ def api() -> str:
     lines = [
         "# API",
         "",
-        "After this page you know how each public name is called. Arrays are named by their axes: "
-        "`[..., 12]` has any leading axes. Units are SI, angles are radians; frames are those of "
-        "[geometry and state](method/geometry.md). Everything that is not listed here may change "
-        "without notice.",
+        "After this page you know how each public name is called. `vw.NAME` is a name of the "
+        "package itself (`import vertiwm_jax as vw`), loaded when it is used. Arrays are named by "
+        "their axes: `[..., 12]` has any leading axes. Units are SI, angles are radians; frames "
+        "are those of [geometry and state](method/geometry.md). Everything that is not listed here "
+        "may change without notice.",
     ]
-    for group, names in PUBLIC.items():
+    grouped = {name for names in PUBLIC.values() for name in names}
+    others = tuple(name for name in vertiwm_jax.__all__ if name not in grouped)
+    for group, names in (PUBLIC | ({"More": others} if others else {})).items():
         lines += ["", f"## {group}"]
         for path in names:
-            module, _, name = path.rpartition(".")
+            module, _, name = f"{PACKAGE}.{path}".rpartition(".")
             lines += _documented(path, getattr(importlib.import_module(module), name))
     return "\n".join(lines) + "\n"
 
 
 def _documented(path: str, thing: Any) -> Iterator[str]:
-    yield from ("", f"### {path.rpartition('.')[2]} {{ #{path.replace('.', '-').lower()} }}", "")
-    yield from (f"`{path}`", "", "```python", _signature(thing.__name__, thing), "```", "")
+    module, _, name = path.rpartition(".")
+    yield from ("", f"### {name} {{ #{path.replace('.', '-').lower()} }}", "")
+    yield from (f"`from {PACKAGE}.{module} import {name}`" if module else f"`vw.{name}`", "")
+    yield from ("```python", _signature(thing.__name__, thing), "```", "")
     yield from _told_in_markdown(thing)
     for name, method in vars(thing).items() if inspect.isclass(thing) else ():
         function = getattr(method, "__func__", getattr(method, "func", method))
@@ -207,6 +193,8 @@ def _parameter(parameter: inspect.Parameter) -> str:
 
 
 def _annotation(kind: Any) -> str:
+    if typing.get_origin(kind) is typing.Annotated:
+        kind = typing.get_args(kind)[0]
     text = kind.__name__ if isinstance(kind, type) and not typing.get_args(kind) else str(kind)
     return re.sub(r"\b([A-Za-z_]\w*[.])+", "", "None" if text == "NoneType" else text)
 
