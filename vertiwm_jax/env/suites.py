@@ -1,4 +1,4 @@
-"""Which worlds to train on, which to keep for the test, and the tasks on both."""
+"""Worlds to train on, worlds kept for tests, and the tasks on both."""
 
 import math
 from pathlib import Path
@@ -31,27 +31,27 @@ class GroundConfig:
     training: WorldConfig = WorldConfig(("mid", "high"), rocks=20, trees=2, obstructed=0.5)
     """Procedural worlds to train on, unless maps are given; low ones teach little."""
     train_worlds: Count = 180
-    """How many of them."""
+    """Number of procedural worlds to train on."""
     suites: Annotated[tuple[Suite, ...], AtLeastOne] = ("easy", "hard", "obstacles")
     """Procedural worlds to test on, unless maps are given."""
     suite_worlds: Count = 6
-    """How many of each suite."""
+    """Number of worlds of each suite."""
     held_out_every: CountOrZero = 5
-    """Of given maps, every so-manieth is not trained on but tested on."""
+    """Every n-th of the given maps is kept for testing, not trained on."""
     starts: CountOrZero = 1024
-    """Random tasks to train on, beside those across the circle of every world."""
+    """Number of random tasks to train on, besides those across the circle of every world."""
     pairs: Count = 10
-    """Tasks across the circle of a world."""
+    """Number of tasks across the circle of each world."""
     sway: NotNegative = 0.25
-    """How far, rad, each of them may turn to a more level start; 0 is Verti-Bench's circle."""
+    """Largest turn of such a task about the circle to a more level start, rad; none by 0."""
     obstacles: bool = False
-    """Whether the rocks and trees of given maps stand there; without them as in the paper."""
+    """Whether given maps keep their rocks and trees; the paper drives without them."""
 
 
 def grounds(
     config: GroundConfig, path: Path | None, key: jax.Array, scale: float = 1.0
 ) -> tuple[TerrainMap, TerrainMap]:
-    """The worlds to train on and those held out, from maps at `path` or else procedural.
+    """The worlds to train on and those held out: maps at `path`, or procedural worlds.
 
     path, scale: see `files.load_map`. Too few maps to hold any out raise `ValueError`.
     """
@@ -111,7 +111,7 @@ def suites(terrain: TerrainMap) -> list[str]:
 
 
 def difficulties(terrain: TerrainMap) -> list[str]:
-    """The preset of difficulty that each world's median slope is nearest to."""
+    """The preset of difficulty whose median slope is nearest to that of each world."""
     names = list(MEDIAN_SLOPE_DEG)
     presets = np.array(list(MEDIAN_SLOPE_DEG.values()))
     slopes = map(_median_slope_deg, np.asarray(terrain.elevation) / float(terrain.resolution))

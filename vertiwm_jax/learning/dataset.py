@@ -24,14 +24,14 @@ SPLITS: dict[Split, range] = {
     "validation": range(20, 22),
     "test": range(22, 25),
 }
-"""Drives of each file by index, as the collections are split."""
+"""Indices of the drives of each file in each split."""
 
 Array = np.ndarray | jax.Array
 
 
 @struct.dataclass
 class Auxiliary:
-    """What may be recorded beside the states; None where it was not. Wheels FL, FR, RL, RR.
+    """Recorded signals of wheels and chassis, None where missing. Wheels are FL, FR, RL, RR.
 
     wheel_omega: `[..., 4]` rad/s, positive forward.
     wheel_sinkage: `[..., 4]` m below the undeformed ground; negative in the air.
@@ -51,8 +51,8 @@ class Auxiliary:
 class Drives:
     """D drives of at most T steps: in host memory once loaded, `jax.device_put` moves them.
 
-    state: `[D, T + 1, 12]` float32; control: `[D, T, 2]` float32; length: `[D]` valid steps, what
-    comes after them means nothing; wheel_class: `[D, T + 1, 4]` uint8; world: `[D]` index into
+    state: `[D, T + 1, 12]` float32; control: `[D, T, 2]` float32; length: `[D]` valid steps, later
+    values have no meaning; wheel_class: `[D, T + 1, 4]` uint8; world: `[D]` index into
     the terrain map; auxiliary: leaves `[D, T + 1, ...]` float32.
     """
 

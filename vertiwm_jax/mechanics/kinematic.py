@@ -1,4 +1,4 @@
-"""Vehicles without forces: the baselines that every dynamics model has to beat."""
+"""Kinematic baselines: vehicles without forces."""
 
 from dataclasses import dataclass, replace
 
@@ -135,7 +135,7 @@ def place(
         terrain: the map, with the world selected.
         xy: `[2]` m in the frame of the world; the middle of the map by default.
         yaw: heading, rad from x (east) to y (north).
-        vehicle: which it is; the HMMWV by default.
+        vehicle: the HMMWV by default.
         speed: m/s, forward.
 
     Returns:

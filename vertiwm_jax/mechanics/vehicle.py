@@ -1,4 +1,4 @@
-"""What a four-wheeled vehicle is: masses, suspension, drivetrain, controller, limits."""
+"""A four-wheeled vehicle: masses, suspension, drivetrain, speed controller and limits."""
 
 from dataclasses import fields
 from functools import cache
@@ -17,7 +17,7 @@ from vertiwm_jax.state import Command
 
 GRAVITY = 9.81
 HMMWV = "hmmwv"
-"""The name of the vehicle that drives unless another is chosen."""
+"""Name of the default vehicle."""
 
 
 @struct.dataclass
@@ -33,7 +33,7 @@ class Vehicle:
     wheel_position: `[4, 2]` x, y of the wheel centres, m.
     wheel_radius, wheel_width: `[]` m.
     wheel_inertia: `[]` kg m2 about the axle.
-    wheel_weight: `[]` N, what pulls an airborne wheel down.
+    wheel_weight: `[]` N, pulls an airborne wheel down.
     spring: `[4]` N/m at the wheel.
     damper: `[4]` N s/m at the wheel.
     free_travel: `[4]` m, wheel height in the body at which the spring is relaxed.
@@ -114,9 +114,9 @@ class Vehicle:
 
 @settings
 class VehicleConfig:
-    """The numbers of a vehicle, SI units, as a file in `configs/vehicles` holds them.
+    """The numbers of a vehicle in SI units, as in a file of `configs/vehicles`.
 
-    Axes and fields are those of `Vehicle`; left and right are alike, pairs are front and rear.
+    Axes and fields are those of `Vehicle`. Left and right are equal; pairs are front and rear.
     """
 
     mass: Positive
@@ -136,7 +136,7 @@ class VehicleConfig:
     wheel_inertia: Positive
     """kg m2 about the axle."""
     wheel_weight: Positive
-    """N, what pulls an airborne wheel down."""
+    """N, pulls an airborne wheel down."""
     spring: tuple[Positive, Positive]
     """N/m at the wheel."""
     damper: tuple[Positive, Positive]
@@ -166,8 +166,7 @@ class VehicleConfig:
     width: Positive
     """m, of that rectangle."""
     scale: Positive = 1.0
-    """m at full size that 1 m of the vehicle is: about 10 for a 1/10-scale rover, so that it is as
-    large as an HMMWV there."""
+    """The factor to HMMWV size: 10 for a 1/10-scale rover."""
 
     def check(self) -> None:
         for name, value in vars(self).items():
@@ -228,7 +227,7 @@ def load_vehicle(name: str = HMMWV) -> Vehicle:
 
 @cache
 def hmmwv() -> Vehicle:
-    """Chrono's HMMWV, which the model that comes with the package knows."""
+    """Chrono's HMMWV, the vehicle of the shipped model."""
     return load(HMMWV).vehicle
 
 

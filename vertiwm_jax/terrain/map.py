@@ -1,4 +1,4 @@
-"""The terrain map: what the ground is, everywhere, for one world or many stacked ones."""
+"""The terrain map of one world, or of many stacked worlds."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,7 +21,7 @@ _SHARED = ("origin", "resolution", "class_rgb", "deformable")
 
 
 class MapError(UserError, ValueError):
-    """A map that cannot be used; the message names the file, the field and the mend."""
+    """A map cannot be used; the message names the file, the field and what to do."""
 
     def __init__(self, name: str, field: str, expected: str, found: str, mend: str = "") -> None:
         ending = f"; {mend}" if mend else ""
@@ -48,8 +48,9 @@ class TerrainMap:
         written by `with_soils`. Those of rigid classes are never used but finite.
     world: `[]` int32, the selected world.
     class_names: K names, static.
-    grip: `[]` what all friction is multiplied by; None for 1.
-    belief: what is known of the selected world, which is all that queries tell; None for all of it.
+    grip: `[]` factor on all friction; None for 1.
+    belief: what a vehicle knows of the selected world, which queries then answer from; None for
+        all.
     """
 
     elevation: jax.Array

@@ -46,13 +46,13 @@ _VORONOI_CELLS = 10
 
 @dataclass(frozen=True)
 class ReliefConfig:
-    """Shape of the ground, before it is scaled to its median slope. Pairs are drawn between.
+    """Shape of the ground before it is scaled to its median slope. Pairs are bounds of a draw.
 
     exponent: fall of the amplitude spectrum of the roughness with spatial frequency; larger is
         smoother.
-    shortest, longest: wavelengths of the roughness, m.
-    patchiness: standard deviation of the logarithm of the roughness from place to place; what
-        makes steep spots steeper than those of even ground of the same median slope.
+    shortest, longest: bounds of the wavelengths of the roughness, m.
+    patchiness: standard deviation of the logarithm of the roughness between places. It makes
+        steep spots steeper at the same median slope.
     hills: largest height of hills of 25 to 130 m, in multiples of the roughness' scale.
     ridges: largest number of ridges and ditches.
     clearing: probability of a nearly level clearing.
@@ -69,12 +69,12 @@ class ReliefConfig:
 
 @settings
 class WorldConfig:
-    """What to draw. Worlds cycle through all pairs of a difficulty and a kind, in `labels` order.
+    """Settings of procedural worlds, which cycle through all pairs of difficulty and kind.
 
     difficulties: preset names, or median slopes in degrees.
     kinds: rigid ground, soil, or rectangles of soil in rigid ground.
-    rocks, trees: how many of each stand in a world, if any do.
-    obstructed: probability that some do.
+    rocks, trees: number of each in a world with obstacles.
+    obstructed: probability that a world has obstacles.
     """
 
     difficulties: tuple[Difficulty | float, ...] = ("low", "mid", "high")
