@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from vertiwm_jax import checkpoints, cli
+from vertiwm_jax import cli
 from vertiwm_jax import config as configuration
-from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl import experiment, policy
 from vertiwm_jax.rl.experiment import TrainConfig
 from vertiwm_jax.rl.learned import MeanAction
 from vertiwm_jax.terrain import map as terrain_map
@@ -57,7 +57,7 @@ def refusal(door: Door, *argv: object) -> str:
 
 
 def untrained(kind: type[TrainConfig], run: Path) -> list[MeanAction]:
-    """Policies of random weights, one a seed, left as a checkpoint beside `config.yaml`."""
+    """Policies of random weights, one a seed, left as those of the run beside `config.yaml`."""
     config = configuration.load(kind, run / "config.yaml")
     level = terrain_map.build(np.zeros((129, 129)), np.zeros((1, 1), int))
     training = experiment.test_environment(config, level)
@@ -72,7 +72,8 @@ def untrained(kind: type[TrainConfig], run: Path) -> list[MeanAction]:
         return jnp.asarray(rng.uniform(0.1, 1, leaf.shape), leaf.dtype)
 
     state = jax.tree.map(drawn, shapes)
-    checkpoints.save(run / "checkpoints", 1, state, keep=1)
+    learned = algorithm.policy(training.params, state), algorithm.value(training.params, state)
+    policy.save(run / policy.FOLDER, config.of_policy, *learned)
     return [
         algorithm.policy(training.params, jax.tree.map(lambda x, i=i: x[i], state))
         for i in range(config.loop.seeds)

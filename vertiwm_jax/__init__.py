@@ -15,7 +15,10 @@ if TYPE_CHECKING:
     from vertiwm_jax.mechanics.kinematic import place as place
     from vertiwm_jax.mechanics.vehicle import Vehicle as Vehicle
     from vertiwm_jax.mechanics.vehicle import load_vehicle as load_vehicle
+    from vertiwm_jax.rl.experiment import train as train
     from vertiwm_jax.rl.mppi import MPPI as MPPI
+    from vertiwm_jax.rl.policy import Policy as Policy
+    from vertiwm_jax.rl.policy import load_policy as load_policy
     from vertiwm_jax.state import Command as Command
     from vertiwm_jax.state import VehicleState as VehicleState
     from vertiwm_jax.terrain.files import load_map as load_map
@@ -29,6 +32,9 @@ _PUBLIC = {
     "Command": "state",
     "Dynamics": "dynamics",
     "MPPI": "rl.mppi",
+    "Policy": "rl.policy",
+    "load_policy": "rl.policy",
+    "train": "rl.experiment",
     "NavigationEnv": "env.navigation",
     "TerrainMap": "terrain.map",
     "Vehicle": "mechanics.vehicle",

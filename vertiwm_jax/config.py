@@ -142,7 +142,7 @@ def default_config(name: str) -> Path:
             return path
     inside, name = Path(name).parent, Path(name).name
     known = [path.stem for folder in _FOLDERS for path in sorted((folder / inside).glob("*.yaml"))]
-    raise ConfigError(f"no configuration named {name!r}: expected {_choices(name, known)}")
+    raise ConfigError(f"no configuration named {name!r}: expected {choices(name, known)}")
 
 
 def find(path: str | Path) -> Path:
@@ -167,7 +167,7 @@ def load(cls: type[T], path: str | Path) -> T:
         tree = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except FileNotFoundError as error:
         beside = [file.name for file in sorted(path.parent.glob("*.y*ml"))]
-        hint = f": expected {_choices(path.name, beside)} in {path.parent}" if beside else ""
+        hint = f": expected {choices(path.name, beside)} in {path.parent}" if beside else ""
         raise ConfigError(f"{path}: no such file{hint}") from error
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: expected a readable UTF-8 file, found: {error}") from error
@@ -242,7 +242,7 @@ def _convert_dataclass(value: Any, cls: Any, field: str, base: Any = None) -> An
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     for key in value:
         if key not in fields:
-            expected = _choices(str(key), fields)
+            expected = choices(str(key), fields)
             raise _MismatchError(f"{_join(field, key)}: unknown key, expected {expected}")
     for name, f in fields.items():
         no_default = f.default is f.default_factory is dataclasses.MISSING
@@ -294,7 +294,8 @@ def _found(value: Any) -> str:
     return "null" if value is None else f"{value!r} ({type(value).__name__})"
 
 
-def _choices(name: str, known: Iterable[str]) -> str:
+def choices(name: str, known: Iterable[str]) -> str:
+    """What may stand in the place of `name`, and what was likely meant, for messages."""
     known = list(known)
     return f"one of {', '.join(known) or '(none)'}{_hint(name, known)}"
 

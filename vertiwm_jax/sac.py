@@ -5,6 +5,10 @@ if __name__ == "__main__":
 
     main("sac")
 elif __name__ == "vertiwm_jax.sac":
+    from functools import partial
+
+    from vertiwm_jax.rl.experiment import train as _train
     from vertiwm_jax.rl.sac import SAC, SACConfig
 
-    __all__ = ["SAC", "SACConfig"]
+    train = partial(_train, "sac")
+    __all__ = ["SAC", "SACConfig", "train"]

@@ -136,12 +136,13 @@ def train(
     work: Work,
     config: CheckpointConfig,
     restored: tuple[int, State] | None = None,
+    saved: Callable[[State], None] = lambda state: None,
 ) -> State:
     """Trains until `iterations` are done, from the beginning or from what `restore` gave.
 
-    Gives the final state. Ctrl-C or SIGTERM, on any host, ends the current iteration, saves and
-    raises `TrainingInterrupted`; a second one stops at once. `TrainingError` when an iteration says
-    that it is not finite.
+    Gives the final state; `saved` gets each state of which a checkpoint was written. Ctrl-C or
+    SIGTERM, on any host, ends the current iteration, saves and raises `TrainingInterrupted`; a
+    second one stops at once. `TrainingError` when an iteration says that it is not finite.
     """
     folder = run.folder / "checkpoints"
     if restored:
@@ -175,8 +176,10 @@ def train(
             progress.advance(work.amount, "  ".join(shown))
             if done % config.checkpoint_every == 0:
                 checkpoints.save(folder, done, state, config.keep)
+                saved(state)
         if done % config.checkpoint_every:
             checkpoints.save(folder, done, state, config.keep)
+            saved(state)
     if done < iterations:
         raise TrainingInterrupted(
             f"stopped after iteration {done} of {iterations}, all saved; "

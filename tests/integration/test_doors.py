@@ -74,15 +74,15 @@ def numbers(run):
 
 def learned(run):
     config = experiment.load(run / "config.yaml")
-    return experiment.learned(config, experiment.held_out(config), run)
+    return experiment.learned(config, run)
 
 
 @pytest.mark.smoke
 def test_a_run_leaves_all_that_was_promised(run, folder):
     left = {path.name.split(".tfevents")[0] for path in run.iterdir()}
     assert left >= {
-        "config.yaml", "metrics.jsonl", "events.out", "checkpoints", "learning_curves.png",
-        "summary.md", "summary.json", "episodes.csv",
+        "config.yaml", "metrics.jsonl", "events.out", "checkpoints", "policy",
+        "learning_curves.png", "summary.md", "summary.json", "episodes.csv",
     }  # fmt: skip
     lines = runs.read_metrics(run)
     assert [line["step"] for line in lines] == [1, 2, 3, 4]
@@ -273,7 +273,7 @@ def test_a_policy_of_a_known_map_drives_on_one_that_is_revealed(run):
 @pytest.mark.usefixtures("nothing_driven")
 @pytest.mark.parametrize("planning", [True, False, None])
 def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path):
-    (tmp_path / "checkpoints").symlink_to(run / "checkpoints")
+    (tmp_path / "policy").symlink_to(run / "policy")
     for of_run in (PlanningConfig(candidates=3), None):
         config = replace(configuration.load(PPOTraining, run / "config.yaml"), planning=of_run)
         configuration.save(config, tmp_path / "config.yaml")
@@ -327,11 +327,13 @@ def test_policies_that_are_none_are_named(run, tmp_path):
     assert "none/config.yaml: no such file" in message
     shutil.copy(run / "config.yaml", tmp_path)
     message = refusal(door("evaluate"), *navigate, tmp_path)
-    assert message.endswith("expected checkpoints of a training, found none")
-    text = (run / "config.yaml").read_text().replace("hidden: [8]", "hidden: [4]")
-    (tmp_path / "config.yaml").write_text(text)
-    shutil.copytree(run / "checkpoints", tmp_path / "checkpoints")
-    assert "belongs to another configuration" in refusal(door("evaluate"), *navigate, tmp_path)
+    assert message.endswith("expected the folder of a trained policy, found none")
+    other = shutil.copytree(run / "policy", tmp_path / "policy") / "policy.yaml"
+    other.write_text(other.read_text().replace("hidden: [8]", "hidden: [4]"))
+    message = refusal(door("evaluate"), *navigate, tmp_path)
+    assert "weights.npz: actor.params." in message and "as policy.yaml says" in message
+    (tmp_path / "policy" / "weights.npz").write_bytes(b"no archive")
+    assert "weights.npz: cannot read" in refusal(door("evaluate"), *navigate, tmp_path)
     newest = checkpoints.latest(run / "checkpoints")
     assert newest is not None and newest.name in ("4", "5")
 

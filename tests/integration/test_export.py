@@ -236,16 +236,16 @@ def test_a_run_is_exported_as_it_is_evaluated(run_and_policy, tmp_path, capsys):
 
 def test_what_cannot_be_exported_is_named_and_leaves_nothing(run_and_policy, tmp_path, monkeypatch):
     run, _ = run_and_policy
-    assert "none/config.yaml: no such file" in refusal(door("export"), tmp_path / "none")
+    none = "none: expected the folder of a trained policy, found none"
+    assert none in refusal(door("export"), tmp_path / "none")
     assert not (tmp_path / "none").exists()
     assert "seed: expected 0 to 1, found 2" in refusal(door("export"), run, "--seed", 2)
-    (tmp_path / "config.yaml").write_text(TINY)
-    assert "expected checkpoints of a training" in refusal(door("export"), tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
+    assert "expected the folder of a trained policy" in refusal(door("export"), tmp_path)
+    assert not list(tmp_path.iterdir())
     monkeypatch.delitem(sys.modules, "vertiwm_jax.deploy.onnx_graph")
     monkeypatch.setitem(sys.modules, "onnx", None)
     assert 'pip install "vertiwm-jax[export]"' in refusal(door("export"), run)
-    assert {path.name for path in run.iterdir()} == {"config.yaml", "checkpoints"}
+    assert {path.name for path in run.iterdir()} == {"config.yaml", "policy"}
 
 
 @pytest.mark.parametrize("function", [np.sin, np.sort])

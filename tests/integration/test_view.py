@@ -73,8 +73,8 @@ def test_a_policy_on_a_held_out_task(tmp_path, capsys):
     assert any("sinkage" in entity for entity in entities)
     assert "task: expected 0 to 1, found 2" in refusal(door("view"), *argv, "--task", 2)
     assert "drive: is of a file" in refusal(door("view"), *argv, "--drive", 0)
-    (tmp_path / "checkpoints" / "1").rename(tmp_path / "gone")
-    assert "expected checkpoints of a training" in refusal(door("view"), *argv)
+    (tmp_path / "policy").rename(tmp_path / "gone")
+    assert "expected the folder of a trained policy" in refusal(door("view"), *argv)
 
 
 def test_without_rerun(tmp_path, monkeypatch):

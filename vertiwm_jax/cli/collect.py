@@ -13,13 +13,13 @@ import tyro
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
-from vertiwm_jax.cli import arguments, export
+from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import Bounds, ConfigError, Count, settings
 from vertiwm_jax.env.agent import Policy
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig
-from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl.policy import load_policy
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.simulators import chrono, collection, excitation, processes
 from vertiwm_jax.simulators.builtin import BuiltIn
@@ -30,6 +30,7 @@ from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import files, worlds
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.worlds import Difficulty, Kind, WorldConfig
+from vertiwm_jax.world_model.choice import eyes
 from vertiwm_jax.world_model.perception import Eyes
 
 SHORTEST = 0.8
@@ -176,9 +177,10 @@ def _learned(command: Collect) -> tuple[Policy, NavigationConfig, Eyes | None] |
     run = command.policy
     if run is None:
         return None
-    config = replace(experiment.load(run / "config.yaml"), vehicle=command.vehicle)
-    policy, eyes = jax.device_get(export.restore(config, run, seed=0))
-    return policy, config.navigation, eyes
+    policy = load_policy(run).on(vehicle.load(command.vehicle))
+    seen_by = eyes(policy.config.weights) if policy.task.embeddings else None
+    acting, seen_by = jax.device_get((policy.acting, seen_by))
+    return acting, policy.task, seen_by
 
 
 def _claim(command: Collect) -> None:

@@ -147,7 +147,7 @@ def _learned(row: Row, settings: TrainConfig, folder: Path) -> Policies:
     """The policies of a training, by their names in the table."""
 
     def restored(terrain: TerrainMap) -> dict[str, Policy | Agent]:
-        found = experiment.learned(settings, terrain, folder)
+        found = experiment.learned(settings, folder)
         return {name.replace(row.algorithm, str(row), 1): x for name, x in found.items()}
 
     return restored

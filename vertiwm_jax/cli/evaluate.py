@@ -274,9 +274,9 @@ def _navigate(command: Navigation) -> None:
     test = external.test_in(command.simulator, config, terrain)
     policies = config.baselines
     if run:
-        # Checkpoints hold episodes, which know as much of the map as in training.
+        # It plans as it was trained, also where it knows less of the map.
         own = replace(config, navigation=trained.navigation)
-        policies = experiment.learned(own, terrain, run) | policies
+        policies = experiment.learned(own, run) | policies
     elif command.policy == "mppi":
         dynamics, weights = experiment.dynamics(config, command.mppi.model)
         env = NavigationEnv(dynamics, config.navigation)

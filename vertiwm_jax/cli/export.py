@@ -3,7 +3,7 @@
 import io
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -17,10 +17,8 @@ from vertiwm_jax.config import ConfigError
 from vertiwm_jax.deploy import description, run_policy, stablehlo
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import Vehicle
-from vertiwm_jax.rl import experiment
-from vertiwm_jax.rl.experiment import TrainConfig
 from vertiwm_jax.rl.learned import Corrected, MeanAction
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.rl.policy import load_policy
 from vertiwm_jax.world_model.choice import eyes
 from vertiwm_jax.world_model.perception import Eyes
 
@@ -32,7 +30,7 @@ class Export:
     """Write what a run has learned as robots can run it: StableHLO, ONNX, and NumPy alone."""
 
     run: tyro.conf.Positional[Path]
-    """Folder of a policy's training."""
+    """Folder of a policy's training, or of a policy."""
     output: Path | None = None
     """Folder to make; `export` in that of the run by default."""
     seed: int = 0
@@ -42,33 +40,14 @@ class Export:
 def run(name: str, words: Sequence[str]) -> None:
     command = arguments.read(Export, name, words)
     folder = command.output or command.run / "export"
-    record, config = _recorder(), experiment.load(command.run / "config.yaml")
+    record, policy = _recorder(), load_policy(command.run, command.seed)
+    config = policy.config
+    seen_by = eyes(config.weights) if policy.task.embeddings else None
+    told = policy.task, config.vehicle.vehicle, config.action_repeat
     with runs.new_folder(folder) as unfinished:
-        driven = config.driven.vehicle
-        policy, eyes = restore(config, command.run, command.seed)
-        made = files(policy, eyes, config.navigation, driven, config.action_repeat, record)
-        for file, data in made.items():
+        for file, data in files(policy.acting, seen_by, *told, record).items():
             runs.write_atomic(unfinished / file, data)
     print(f"the policy is in {folder}")
-
-
-def restore(
-    config: TrainConfig, run: Path, seed: int
-) -> tuple[Corrected | MeanAction, Eyes | None]:
-    """What the run in the folder `run` has learned, as tests drive it without planning.
-
-    Also the encoders that it sees embeddings by, if it sees any. `ConfigError` or
-    `CheckpointError` if there is no such policy.
-    """
-    seeds = config.loop.seeds
-    if not 0 <= seed < seeds:
-        raise ConfigError(f"{run}: seed: expected 0 to {seeds - 1}, found {seed}")
-    # Checkpoints are read beside an environment of their kind, on any ground.
-    level = terrain_map.build(np.zeros((129, 129)), np.zeros((1, 1), np.int32))
-    policies = experiment.learned(replace(config, planning=None), level, run)
-    policy = list(policies.values())[seed]
-    assert isinstance(policy, Corrected | MeanAction)
-    return policy, eyes(config.weights) if config.navigation.embeddings else None
 
 
 def files(

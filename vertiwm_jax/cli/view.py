@@ -119,7 +119,7 @@ def _driven(command: View) -> Scene:
     if command.vehicle is not None:
         config = replace(config, vehicle=command.vehicle)
     terrain = experiment.held_out(config)
-    policies = experiment.learned(config, terrain, run)
+    policies = experiment.learned(config, run)
     pool = suites.test_tasks(config.ground, terrain)
     for name, found, count in (("task", number, len(pool.world)), ("seed", seed, len(policies))):
         if not 0 <= found < count:

@@ -55,7 +55,7 @@ def after_training(trained: Trained) -> str:
     plots.save(figure, folder / "learning_curves.png")
     machine.forget_programs()  # Tests need the memory.
     test = experiment.test_environment(config, trained.held_out)
-    policies = trained.policies | config.baselines
+    policies = experiment.learned(config, folder) | config.baselines
     groups = drive(test.env, test.params, policies, config.key("testing"))
     write(folder, groups, REFERENCE, test.params.terrain, config.navigation.goal_radius)
     return markdown(groups, REFERENCE)

@@ -2,16 +2,15 @@
 
 import logging
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol, cast
 
 import jax
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import machine
-from vertiwm_jax.checkpoints import CheckpointError
-from vertiwm_jax.config import Count
+from vertiwm_jax.config import ConfigError, Count
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import controllers, suites, tasks
 from vertiwm_jax.env.action_repeat import ActionRepeat, Controller
@@ -25,11 +24,12 @@ from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
-from vertiwm_jax.rl import loop
-from vertiwm_jax.rl.learned import Corrected, MeanAction, TwinValue, Value
+from vertiwm_jax.rl import loop, policy
+from vertiwm_jax.rl.learned import MeanAction, TwinValue, Value
 from vertiwm_jax.rl.loop import LoopConfig
 from vertiwm_jax.rl.off_policy import OffPolicy
 from vertiwm_jax.rl.planning import Planner, PlanningConfig
+from vertiwm_jax.rl.policy import Base, PolicyConfig, load_policy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
 from vertiwm_jax.rl.settings import LearningConfig
@@ -134,7 +134,7 @@ class TrainConfig(TaskConfig, ABC):
     """Folder that keeps compiled programs for later runs."""
     action_repeat: Count = 4
     """Steps of 0.1 s that an action is held while learning; `transitions` count actions."""
-    base: Literal["look ahead", "straight to goal", "none"] = "look ahead"
+    base: Base = "look ahead"
     """The controller that the policy learns to correct; it acts at every step."""
     planning: PlanningConfig | None = None
     """How the policy plans in tests, besides driving as it is; learning does not need it."""
@@ -154,6 +154,23 @@ class TrainConfig(TaskConfig, ABC):
     def controller(self) -> Controller | None:
         """What the policy corrects."""
         return None if self.base == "none" else self.baselines[self.base]
+
+    @property
+    def of_policy(self) -> PolicyConfig:
+        """What is kept beside what it learns."""
+        return PolicyConfig(
+            algorithm=cast(Any, self.name),
+            hidden=self.schedule.hidden,
+            initial_log_std=getattr(self.schedule, "initial_log_std", None),
+            navigation=self.navigation,
+            base=self.base,
+            action_repeat=self.action_repeat,
+            discount=self.schedule.discount,
+            vehicle=self.driven,
+            model=self.model,
+            weights=self.weights,
+            seeds=self.loop.seeds,
+        )
 
     def repeated(self, env: NavigationEnv) -> ActionRepeat:
         """The task as algorithms see it."""
@@ -225,14 +242,20 @@ def training_environment(config: TaskConfig) -> tuple[Task, TerrainMap]:
     return environment(config, config.model, terrain, pool, config.variation), held_out
 
 
-def training_ground(config: TaskConfig) -> tuple[TerrainMap, Tasks, TerrainMap]:
+def training_ground(
+    config: TaskConfig, given: TerrainMap | None = None
+) -> tuple[TerrainMap, Tasks, TerrainMap]:
     """The worlds to train on, tasks on them, and the worlds held out for `test_environment`.
 
-    Maps that cannot be used, and tasks that cannot be driven on them, raise `ValueError`.
+    given: worlds to train and to test on, in place of those of the configuration. Raises `MapError`
+    or `TaskError` where maps, or tasks on them, cannot be used.
     """
     navigation, driven = config.navigation, config.driven
     key = config.key("worlds")
-    terrain, held_out = suites.grounds(config.ground, config.worlds, key, driven.scale)
+    if given is None:
+        terrain, held_out = suites.grounds(config.ground, config.worlds, key, driven.scale)
+    else:
+        terrain = held_out = given
     # Now, and not when the training is over.
     tests = suites.test_tasks(config.ground, held_out)
     tasks.validate(tests, held_out, navigation.goal_radius, navigation.map_margin)
@@ -290,16 +313,15 @@ def outcomes(info: dict[str, jax.Array]) -> dict[str, jax.Array]:
 
 @dataclass(frozen=True)
 class Trained:
-    """What a training has left: its folder, what has learned, and worlds to test it on."""
+    """What a training has left: its folder, with what has learned, and worlds to test it on."""
 
     config: TrainConfig
     folder: Path
-    policies: Rows
     held_out: TerrainMap
 
 
-def run(config: TrainConfig) -> Trained:
-    """Trains, or goes on with, the policies of one training.
+def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
+    """Trains, or goes on with, the policies of one training; given: as in `training_ground`.
 
     Tells by logging what it does. Raises `UserError` where settings, maps, tasks, an earlier run or
     the disk do not allow it, and `TrainingInterrupted` at Ctrl-C once all is saved.
@@ -307,7 +329,7 @@ def run(config: TrainConfig) -> Trained:
     keep_compiled(config.compile_cache)
     config = replace(config, operands=config.multiplied)  # So that it goes on as it began.
     _log.info("drawing worlds ...")
-    terrain, pool, held_out = training_ground(config)
+    terrain, pool, held_out = training_ground(config, given)
     machine.forget_programs()
     moves, weights = dynamics(config, config.model)
     env = NavigationEnv(moves, config.navigation, config.variation)
@@ -325,6 +347,11 @@ def run(config: TrainConfig) -> Trained:
         _log.info("run folder %s", begun.folder)
         products = "" if config.model == "builtin" else f", multiplying {config.operands}"
         _log.info("training in %s on %d worlds%s", config.model, terrain.worlds, products)
+
+        def keep(state: Any) -> None:
+            learned = algorithm.policy(params, state), algorithm.value(params, state)
+            policy.save(begun.folder / policy.FOLDER, config.of_policy, *learned)
+
         state = loop.train(
             algorithm,
             params,
@@ -335,41 +362,78 @@ def run(config: TrainConfig) -> Trained:
             schedule.shareable,
             config.loop,
             restored,
+            keep,
         )
-    return Trained(config, begun.folder, _policies(config, algorithm, params, state), held_out)
+        keep(state)
+    return Trained(config, begun.folder, held_out)
 
 
-def learned(config: TrainConfig, terrain: TerrainMap, run: Path) -> Rows:
-    """The policies of the run in the folder `run`, one a seed; `CheckpointError` if none.
+def train(
+    config: str | Path = "ppo",
+    terrain: TerrainMap | str | Path | None = None,
+    *,
+    runs: str | Path = "runs",
+    resume: str | Path | None = None,
+    **settings: Any,
+) -> policy.Policy:
+    """Trains a driving policy inside a model of the vehicle.
 
-    terrain: any worlds that tests can be drawn on.
+    Progress is logged; `logging.basicConfig(level="INFO")` shows it.
+
+    Args:
+        config: name of settings that come along (`ppo`, `sac`, `td3`, `ppo_small`, ...), or a YAML
+            file of them.
+        terrain: the worlds to train on, or a path to maps; procedural ones by default.
+        runs: folder in which the folder of this run is made.
+        resume: folder of an earlier run to go on with, with its settings.
+        settings: what is changed of them: fields of the training (`model`, `vehicle`, `seed`, ...)
+            or of its algorithm (`num_envs`, `learning_rate`, ...).
+
+    Returns:
+        The policy, which is also in the folder `policy` of the run; of several seeds the first.
+
+    Raises:
+        ConfigError: a setting is unknown or refused.
+        MapError, TaskError: the maps, or the tasks on them, cannot be used.
+        TrainingInterrupted: Ctrl-C stopped it, once all was saved.
     """
-    moves, weights = dynamics(config, config.model)
-    env = NavigationEnv(moves, config.navigation, config.variation)
-    tests = suites.test_tasks(config.ground, terrain)
-    params = env.shapes(weights, terrain, tests, config.driven.vehicle)
-    algorithm = config.algorithm(env)
-    restored = loop.restore(algorithm, params, run, config.loop.seeds)
-    if restored is None:
-        raise CheckpointError(f"{run}: expected checkpoints of a training, found none")
-    return _policies(config, algorithm, params, restored[1])
+    chosen = load(Path(resume) / "config.yaml" if resume else configuration.find(config))
+    own, of_algorithm = ({field.name for field in fields(x)} for x in (chosen, chosen.schedule))
+    for name in settings:
+        if name not in own | of_algorithm:
+            expected = configuration.choices(name, sorted(own | of_algorithm))
+            raise ConfigError(f"{name}: unknown setting, expected {expected}")
+    changed = {name: settings[name] for name in settings if name in own}
+    schedule = {name: settings[name] for name in settings if name not in own}
+    if schedule:
+        changed[chosen.name] = replace(chosen.schedule, **schedule)
+    if isinstance(terrain, str | Path):
+        changed["worlds"] = Path(terrain)
+    changed |= {"runs": Path(runs), "resume": Path(resume) if resume else None}
+    given = terrain if isinstance(terrain, TerrainMap) else None
+    return load_policy(run(replace(chosen, **changed), given).folder)
 
 
-def _policies(config: TrainConfig, algorithm: Learning, params: TaskParams, state: Any) -> Rows:
-    base, rows = config.controller, {}
-    for seed in range(config.loop.seeds):
-        of_seed = jax.tree.map(lambda x, seed=seed: x[seed], state)
-        policy, name = algorithm.policy(params, of_seed), config.name
-        if config.loop.seeds > 1:
-            name = f"{config.name}, seed {seed}"
-        rows[name] = Corrected(base, policy) if base else policy
+def learned(config: TrainConfig, folder: Path) -> Rows:
+    """The policies of a run, or of the folder of a policy, by their names in tables.
+
+    They drive as `config` says: the same task or another one, planning or not. Raises as
+    `load_policy`.
+    """
+    first = load_policy(folder)
+    seeds, base = first.config.seeds, config.controller
+    rows: Rows = {}
+    for seed in range(seeds):
+        trained = replace(load_policy(folder, seed) if seed else first, base=base)
+        name = config.name if seeds == 1 else f"{config.name}, seed {seed}"
+        rows[name] = trained.acting
         if config.planning:
             moves, weights = dynamics(config, config.planning.model)
             rows[f"{name} with planning"] = Planner(
                 env=NavigationEnv(moves, config.navigation),
                 dynamics=weights,
-                policy=policy,
-                value=algorithm.value(params, of_seed),
+                policy=trained.learned,
+                value=trained.worth,
                 base=base,
                 interval=config.action_repeat,
                 discount=config.schedule.discount,

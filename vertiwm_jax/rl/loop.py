@@ -1,5 +1,6 @@
 """Training of an RL algorithm: the host loop around several seeds at once."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -70,6 +71,7 @@ def train(
     batch: int,
     config: LoopConfig,
     restored: tuple[int, State] | None = None,
+    saved: Callable[[State], None] = lambda state: None,
 ) -> State:
     """`training.train` for `config.seeds` seeds; metrics are means over those that have a value.
 
@@ -78,4 +80,4 @@ def train(
     """
     work = Work("transitions", transitions * config.seeds, ("episode_return", "success"), batch)
     seeds = Seeds(algorithm, config.seeds)
-    return training.train(seeds, env_params, key, run, iterations, work, config, restored)
+    return training.train(seeds, env_params, key, run, iterations, work, config, restored, saved)

@@ -1,0 +1,206 @@
+"""A trained policy in a folder of its own, apart from the training that made it."""
+
+import io
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from vertiwm_jax import config as configuration
+from vertiwm_jax import runs
+from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.config import ConfigError, Count, Share
+from vertiwm_jax.dynamics import EMBEDDING_SHAPE
+from vertiwm_jax.env import observation
+from vertiwm_jax.env.action_repeat import Controller
+from vertiwm_jax.env.controllers import baselines
+from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.mechanics.vehicle import VehicleConfig
+from vertiwm_jax.networks.policy import ActionCritic, Actor, Critic, Senses, SquashedActor
+from vertiwm_jax.rl.learned import Corrected, MeanAction, TwinValue, Value
+from vertiwm_jax.rl.normalise import RunningStatistics
+from vertiwm_jax.world_model.choice import ModelName
+
+FOLDER = "policy"
+"""Name of the folder in that of a run."""
+_ACTIONS = 2
+Base = Literal["look ahead", "straight to goal", "none"]
+
+
+@configuration.settings
+class PolicyConfig:
+    """What `policy.yaml` says of a policy: how its networks are built, and what it is to drive."""
+
+    algorithm: Literal["ppo", "sac", "td3"]
+    """What it was trained by."""
+    hidden: tuple[int, ...]
+    """Widths of the layers of actor and critic."""
+    initial_log_std: float | None
+    """Of the actor, where it is random while it learns."""
+    navigation: NavigationConfig
+    """What the task is."""
+    base: Base
+    """The controller that it corrects."""
+    action_repeat: Count
+    """Steps of 0.1 s that its actions were held while it learned."""
+    discount: Share
+    """Of a decision, by which values were learned."""
+    vehicle: VehicleConfig
+    """What it drove."""
+    model: ModelName
+    """What moved the vehicle."""
+    weights: Path | None = None
+    """Folder of that model, if not the one that comes along."""
+    seeds: Count = 1
+    """How many were trained side by side."""
+    format: Literal[1] = 1
+    """Of the folder."""
+
+    @property
+    def controller(self) -> Controller | None:
+        """What it corrects."""
+        known = baselines(self.navigation, self.vehicle.vehicle)
+        return None if self.base == "none" else known[self.base]
+
+    @property
+    def networks(self) -> tuple[Actor | SquashedActor, Critic | ActionCritic]:
+        """Actor and critic."""
+        image = EMBEDDING_SHAPE if self.navigation.embeddings else None
+        senses, std = Senses(observation.ARCS, image), self.initial_log_std
+        if self.algorithm == "ppo":
+            assert std is not None
+            return Actor(_ACTIONS, self.hidden, std, senses), Critic(self.hidden, senses)
+        return SquashedActor(_ACTIONS, self.hidden, std, senses), ActionCritic(self.hidden, senses)
+
+
+@struct.dataclass
+class Policy:
+    """A trained driving policy; a pytree that can be called.
+
+    learned: the actor with its weights; worth: the critic with its own.
+    base: the controller that it corrects; config: of its folder.
+    """
+
+    learned: MeanAction
+    worth: Value | TwinValue
+    base: Controller | None = struct.field(pytree_node=False)
+    config: PolicyConfig = struct.field(pytree_node=False)
+
+    @property
+    def task(self) -> NavigationConfig:
+        """What the task is that it was trained for."""
+        return self.config.navigation
+
+    @property
+    def acting(self) -> Corrected | MeanAction:
+        """What drives: the controller as corrected, or the actor alone."""
+        return self.learned if self.base is None else Corrected(self.base, self.learned)
+
+    def on(self, vehicle: VehicleConfig) -> Self:
+        """The same policy with a controller of another vehicle."""
+        config = replace(self.config, vehicle=vehicle)
+        return replace(self, config=config, base=config.controller)
+
+    def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
+        """`[..., O]` observations to `[..., 2]` actions in [-1, 1]; no key is needed."""
+        return self.acting(observation, jax.random.key(0) if key is None else key)
+
+    def value(self, observation: jax.Array) -> jax.Array:
+        """`[..., O]` observations to `[...]` returns that it expects, in units of reward."""
+        return self.worth(observation)
+
+
+def save(folder: Path, config: PolicyConfig, policy: MeanAction, value: Value | TwinValue) -> None:
+    """Writes the folder of a policy; leaves have a leading axis of seeds.
+
+    `RunError` where that is not possible.
+    """
+    folder.mkdir(exist_ok=True)
+    arrays = {
+        **_named("actor", policy.params),
+        **_named("critic", value.params),
+        "observation_mean": policy.observations.mean,
+        "observation_variance": policy.observations.variance,
+        "observation_count": policy.observations.count,
+        "return_scale": value.scale,
+    }
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **jax.device_get(arrays))
+    runs.write_atomic(folder / "policy.yaml", configuration.dump(config))
+    runs.write_atomic(folder / "weights.npz", stream.getvalue())
+
+
+def load_policy(folder: str | Path, seed: int = 0) -> Policy:
+    """Loads a trained policy.
+
+    Args:
+        folder: of a run that trained it, or its folder `policy` alone.
+        seed: which of those that were trained side by side.
+
+    Returns:
+        The policy: call it with observations `[..., O]` for actions `[..., 2]` in [-1, 1].
+
+    Raises:
+        CheckpointError: there is no policy in the folder, or its files do not fit each other.
+        ConfigError: there is no such seed, or `policy.yaml` is malformed.
+    """
+    folder = Path(folder)
+    inside = folder / FOLDER
+    place = inside if inside.is_dir() else folder
+    file = place / "weights.npz"
+    if not file.is_file():
+        raise CheckpointError(f"{folder}: expected the folder of a trained policy, found none")
+    config = configuration.load(PolicyConfig, place / "policy.yaml")
+    if not 0 <= seed < config.seeds:
+        raise ConfigError(f"{folder}: seed: expected 0 to {config.seeds - 1}, found {seed}")
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            arrays = {name: jnp.asarray(stored[name][seed]) for name in stored.files}
+    except Exception as error:  # Of zip files, of what they compress and of NumPy's headers.
+        raise CheckpointError(f"{file}: cannot read weights: {error}") from error
+    actor, critic = config.networks
+    seen = jnp.zeros_like(arrays["observation_mean"])
+    observations = RunningStatistics(
+        *(arrays[f"observation_{name}"] for name in ("mean", "variance", "count"))
+    )
+    learned = MeanAction(actor, _weights(file, "actor", arrays, actor.init, seen), observations)
+    scale = arrays["return_scale"]
+    if isinstance(critic, ActionCritic):
+        twins = jax.vmap(critic.init, (0, None, None))
+
+        def init(key: jax.Array, *given: jax.Array) -> Any:
+            return twins(jax.random.split(key), *given)
+
+        params = _weights(file, "critic", arrays, init, seen, jnp.zeros(_ACTIONS))
+        worth = TwinValue(critic, params, learned, scale)
+    else:
+        worth = Value(
+            critic, _weights(file, "critic", arrays, critic.init, seen), observations, scale
+        )
+    return Policy(learned, worth, config.controller, config)
+
+
+def _named(part: str, tree: Any) -> dict[str, jax.Array]:
+    leaves = jax.tree.leaves_with_path(tree)
+    names = (jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves)
+    return {f"{part}.{name}": leaf for name, (_, leaf) in zip(names, leaves, strict=True)}
+
+
+def _weights(
+    file: Path, part: str, arrays: dict[str, jax.Array], init: Callable[..., Any], *given: jax.Array
+) -> Any:
+    """The weights of one network; `CheckpointError` where they are not those of its kind."""
+    like = jax.eval_shape(init, jax.random.key(0), *given)
+    names = _named(part, like)
+    for name, leaf in names.items():
+        found = arrays[name].shape if name in arrays else "none"
+        if found != leaf.shape:
+            raise CheckpointError(
+                f"{file}: {name}: expected shape {leaf.shape} as policy.yaml says, found {found}"
+            )
+    return jax.tree.unflatten(jax.tree.structure(like), [arrays[name] for name in names])
