@@ -6,7 +6,7 @@ from doors import door, refusal
 from learning import recordings
 
 from vertiwm_jax.learning import dataset, schema
-from vertiwm_jax.terrain import files
+from vertiwm_jax.terrain import files, query
 
 QUIET = ("--noise.position", "0", "--noise.attitude", "0", "--noise.latency", "0")
 
@@ -33,8 +33,14 @@ def test_logs_of_a_rover_are_imported_as_they_were_recorded(recorded, tmp_path, 
     np.testing.assert_allclose(10 * small.resolution, known.resolution)
     words = command.split("vertiwm_jax.import_drives ")[1].replace("DRIVES", str(tmp_path))
     door("import_drives")(words.split())
+    # What is said is in the rover's own seconds and metres.
+    said = capsys.readouterr().out
+    assert "| 50.0 |" in said
+    above = float(said.split("the body origin is ")[1].split()[0])
     found, terrain = dataset.load(tmp_path / words.split("/")[-1], "train")
     before, ground = dataset.load(recorded, "train")
+    height = np.asarray(query.height(ground, before.state[..., :2]))
+    assert 10 * above == pytest.approx(np.median(before.state[..., 2] - height), abs=0.02)
     np.testing.assert_allclose(terrain.elevation, ground.elevation, rtol=1e-5)
     np.testing.assert_allclose(terrain.soils.kphi, ground.soils.kphi, rtol=1e-4)
     steps = found.state.shape[1]

@@ -1,47 +1,14 @@
 """`vertiwm import_drives`: logs of other origin as drives to fit and to test on."""
 
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
-import numpy as np
 import tyro
 
-from vertiwm_jax import config as configuration
-from vertiwm_jax import froude, runs
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import AtLeastOne, settings
-from vertiwm_jax.evaluation.tables import markdown
-from vertiwm_jax.importers import collection, grid_map, resampling, rosbag, table, tartandrive
-from vertiwm_jax.importers.log import Log
-from vertiwm_jax.importers.resampling import Drive
-from vertiwm_jax.importers.settings import ImportSettings
-from vertiwm_jax.learning import schema
-from vertiwm_jax.learning.dataset import SPLITS
-from vertiwm_jax.learning.schema import DataError
-from vertiwm_jax.runs import Progress
-from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain.map import TerrainMap
-
-Format = Literal["csv", "parquet", "rosbag", "tartandrive"]
-READERS: dict[Format, Callable[[Path, ImportSettings], list[Log]]] = {
-    "csv": table.read_csv,
-    "parquet": table.read_parquet,
-    "rosbag": rosbag.read,
-    "tartandrive": tartandrive.read,
-}
-ENDINGS: dict[str, Format] = {
-    ".csv": "csv",
-    ".parquet": "parquet",
-    ".bag": "rosbag",
-    ".pt": "tartandrive",
-}
-
-
-LARGEST_ANGLE = np.radians(20)
-"""Between velocity and motion, in the median: another frame, or w before x, lie beyond."""
+from vertiwm_jax.importers.imports import Format, import_drives
 
 
 @settings
@@ -60,141 +27,9 @@ class ImportDrives:
     """The ground, an .npz map; by default that of a bag's GridMap topic."""
 
 
-@dataclass(frozen=True)
-class Imported:
-    """What became of one source: its drives, and of how many poses a second they were made."""
-
-    source: Path
-    drives: list[Drive]
-    poses_per_second: float
-    derived: tuple[str, ...]
-    left_out: Counter[str]
-
-
 def run(name: str, words: Sequence[str]) -> None:
     command = arguments.read(ImportDrives, name, words)
-    print(import_drives(command))
+    asked = {"format": command.format, "map": command.map}
+    print(import_drives(command.sources, command.output, command.settings, **asked))
     print(f"the drives are in {command.output}; to fit the world model to them:")
     print(f"python -m vertiwm_jax.fit --data {command.output}")
-
-
-def import_drives(command: ImportDrives) -> str:
-    """Writes the collection; what there is to say of it, as text."""
-    settings = configuration.load(ImportSettings, command.settings)
-    readers = [_reader(source, command.format) for source in command.sources]
-    with runs.new_folder(command.output) as unfinished:
-        terrain, said = _terrain(command, settings)
-        imported = []
-        with Progress(len(command.sources), "logs") as progress:
-            for source, read in zip(command.sources, readers, strict=True):
-                imported.append(_import(source, read(source, settings), settings, terrain))
-                progress.advance(1, source.name)
-        drives = [drive for each in imported for drive in each.drives]
-        if not drives:
-            raise DataError(
-                f"{command.sources[0]}: expected a drive or more that can be used, found none: "
-                + "; ".join(_reasons(each) for each in imported)
-            )
-        meta = {"sources": [str(source) for source in command.sources]}
-        wheels = settings.vehicle.wheels_in_body_xy
-        collection.write(unfinished, drives, terrain, wheels, meta)
-    return "\n".join([_table(imported), "", *said, *_remarks(drives, terrain)])
-
-
-def _reader(source: Path, asked: Format | None) -> Callable[[Path, ImportSettings], list[Log]]:
-    if not source.exists():
-        raise DataError(f"{source}: expected a file or folder of logs, found none")
-    if asked is None:
-        is_bag = (source / "metadata.yaml").is_file()
-        asked = "rosbag" if is_bag else ENDINGS.get(source.suffix)
-    if asked is None:
-        raise DataError(
-            f"{source}: expected --format, as the name does not tell what it is; one of "
-            + ", ".join(READERS)
-        )
-    return READERS[asked]
-
-
-def _terrain(command: ImportDrives, settings: ImportSettings) -> tuple[TerrainMap, list[str]]:
-    if command.map is not None:
-        if command.map.is_dir():
-            raise DataError(f"{command.map}: expected the .npz map of one world, found a folder")
-        return froude.scaled(files.load(command.map), settings.vehicle.scale), []
-    if settings.rosbag is None or settings.rosbag.grid_map is None:
-        raise DataError(
-            f"{command.settings}: expected ground: give `--map MAP.npz`, which terrain.files.save "
-            "writes (docs/own-map.md), or name a bag's GridMap topic in rosbag.grid_map"
-        )
-    terrain, unknown = grid_map.terrain(command.sources, settings.rosbag.grid_map, settings.frames)
-    terrain = froude.scaled(terrain, settings.vehicle.scale)
-    return terrain, [f"{unknown:.0%} of the map had no height, and took that of the nearest cell"]
-
-
-def _import(
-    source: Path, logs: list[Log], settings: ImportSettings, terrain: TerrainMap
-) -> Imported:
-    """The drives of all logs of a source that are on the map."""
-    drives, left_out = [], Counter[str]()
-    point = settings.vehicle.scale * np.asarray(settings.vehicle.logged_point)
-    for log in logs:
-        found = resampling.resample(log, settings.resampling, point)
-        left_out += found.left_out
-        if found.drives:
-            _check(source, found.drives)
-        kept = [drive for drive in found.drives if collection.on_map(terrain, drive)]
-        left_out["off the map"] += len(found.drives) - len(kept)
-        drives += kept
-    first = logs[0]
-    derived = {"velocity": first.velocity, "angular velocity": first.angular_velocity}
-    return Imported(
-        source=source,
-        drives=drives,
-        poses_per_second=float(1 / np.median(np.concatenate([np.diff(log.time) for log in logs]))),
-        derived=tuple(name for name, logged in derived.items() if logged is None),
-        left_out=+left_out,
-    )
-
-
-def _check(source: Path, drives: Sequence[Drive]) -> None:
-    """Raises `DataError` unless the drives are of the schema, and move where they say."""
-    schema.check(source, collection.arrays(drives))
-    way_off, _ = resampling.directions(drives)
-    if way_off > LARGEST_ANGLE:
-        raise DataError(
-            f"{source}: velocity: expected to point where the positions go, found "
-            f"{np.degrees(way_off):.0f} degrees off in half of the steps; see `frames` of the "
-            "settings, and the order of quaternions"
-        )
-
-
-def _table(imported: Sequence[Imported]) -> str:
-    rows = []
-    for each in imported:
-        steps = sum(len(drive.control) for drive in each.drives)
-        speed, derived = f"{each.poses_per_second:.1f}", ", ".join(each.derived) or "-"
-        drives = f"{len(each.drives)}", f"{steps:,}"
-        rows.append((str(each.source), speed, derived, *drives, _reasons(each)))
-    heads = ["log", "poses a second", "from poses", "drives", "steps", "left out"]
-    return markdown(heads, rows)
-
-
-def _reasons(each: Imported) -> str:
-    return ", ".join(f"{count} {why}" for why, count in each.left_out.items()) or "-"
-
-
-def _remarks(drives: Sequence[Drive], terrain: TerrainMap) -> list[str]:
-    low, middle, high = collection.clearance(terrain, drives)
-    _, axis_off = resampling.directions(drives)
-    lines = [
-        f"the body origin is {middle:.2f} m above the map, half of the time within {low:.2f} and "
-        f"{high:.2f}: expected is about the radius of a wheel",
-        f"the vehicle moves {np.degrees(axis_off):.1f} degrees off its x axis, in the median: "
-        "more than 20 hint at another frame",
-    ]
-    lacking = [split for split, indices in SPLITS.items() if len(drives) <= indices.start]
-    if lacking:
-        lines.append(
-            f"{len(drives)} drives are too few for {' and '.join(lacking)}: expected "
-            f"{collection.PER_FILE} or more; a smaller resampling.longest makes more of them"
-        )
-    return lines
