@@ -64,6 +64,16 @@ def multiplies_bfloat16() -> bool:
     return bool(hosts.of_first(np.array(half < _WORTH_ROUNDING * single)))
 
 
+def together(cpu: int, accelerator: int) -> int:
+    """How much of a batch one device works at together.
+
+    Args:
+        cpu: as much as stays in the cache of a core.
+        accelerator: as much as fills one and fits into its memory.
+    """
+    return cpu if jax.default_backend() == "cpu" else accelerator
+
+
 def release_memory() -> None:
     """Gives back to the system what compilers have freed, which glibc keeps for later."""
     if sys.platform == "linux":

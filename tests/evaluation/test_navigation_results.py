@@ -9,8 +9,7 @@ from env.worlds import bicycle_env, ground, hills
 from flax import struct
 from scipy.stats import binomtest
 
-from vertiwm_jax import parallel
-from vertiwm_jax.env import episodes
+from vertiwm_jax import machine, parallel
 from vertiwm_jax.env.agent import Agent, Now
 from vertiwm_jax.env.controllers import RandomActions, StraightToGoal
 from vertiwm_jax.env.episodes import run_episodes
@@ -83,7 +82,7 @@ decided = []
 
 @pytest.mark.parametrize("together", [1, 4, 100])
 def test_decides_for_each_that_drives_as_if_it_were_alone(short, together, monkeypatch):
-    monkeypatch.setattr(episodes, "_TOGETHER", together)
+    monkeypatch.setattr(machine, "together", lambda **_: together)
     jax.clear_caches()  # Or what was compiled for others together would be found.
     decided.clear()
     env, params = short

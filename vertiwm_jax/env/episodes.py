@@ -9,14 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax import parallel
+from vertiwm_jax import machine, parallel
 from vertiwm_jax.env.agent import Agent, Memory, Now, Policy, as_agent
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.state import STEP_SECONDS
-
-_TOGETHER = 8  # vehicles that a device plans for at a time
 
 Keep = Callable[[TaskParams, TaskState], Any]
 """What is kept of the parameters of a task and of each state of an episode."""
@@ -200,7 +198,8 @@ def _plan(
     if type(agent).plan is Agent.plan:
         return memory
     running = state.ending == TerminationReason.RUNNING
-    together = min(_TOGETHER * parallel.number(), len(running))
+    of_device = machine.together(cpu=8, accelerator=128)
+    together = min(of_device * parallel.number(), len(running))
     turns = -(-len(running) // together)
     # Those that drive come first, and the last turn is filled up with one that likely does not.
     filled = np.minimum(np.arange(turns * together), len(running) - 1)

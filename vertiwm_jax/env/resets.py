@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax import parallel, xla
+from vertiwm_jax import machine, parallel, xla
 from vertiwm_jax.dynamics import Dynamics, History, Params, step
 from vertiwm_jax.env import route, tasks
 from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
@@ -21,7 +21,6 @@ from vertiwm_jax.terrain import patches, query, reveal
 from vertiwm_jax.terrain.map import TerrainMap
 
 _Placed = tuple[VehicleState, History]
-_TOGETHER = 64  # vehicles on a device, of which each has patches in every step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +106,8 @@ class ResetPool:
 def _in_turns(pool: Tasks) -> tuple[int, tuple[Tasks, jax.Array]]:
     """How many vehicles settle at a time, and all tasks with the numbers of their routes."""
     # Not all at once: patches of thousands of vehicles fill gigabytes.
-    together = min(_TOGETHER * jax.device_count(), len(pool.world))
+    of_device = machine.together(cpu=64, accelerator=1024)
+    together = min(of_device * jax.device_count(), len(pool.world))
     return together, (pool, jnp.arange(len(pool.world)))
 
 

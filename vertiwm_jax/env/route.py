@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax import parallel
+from vertiwm_jax import machine, parallel
 from vertiwm_jax.config import Bounds, NotNegative, settings
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.env.traversability import TraversabilityCost, footprint, places
@@ -27,7 +27,6 @@ CLEARANCE = 0.3
 """Clearance to obstacles, m."""
 _MOVES = np.array([(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)])
 _PLACES = np.array([0.0, 0.5, 1.0])  # of a move, where the ground is looked at
-_TOGETHER = 1  # goal, or world, that a device works at: what it reads stays in its cache
 _ROUNDS = 16  # of value iteration, before it is looked whether anything still changes
 _REACH = 2  # cells, of the longest moves along an axis
 _NEAR = 1.5  # cells from a goal within which the way to it is straight
@@ -111,7 +110,7 @@ def _all_costs(
     config: RouteConfig, vehicle: Vehicle, terrain: TerrainMap, world: jax.Array
 ) -> jax.Array:
     """`[W, 16, n, n]`"""
-    each = parallel.vmap(functools.partial(_costs, config), (None, None, 0), _TOGETHER)
+    each = parallel.vmap(functools.partial(_costs, config), (None, None, 0), _together())
     return each(vehicle, terrain, world)
 
 
@@ -120,8 +119,13 @@ def _all_costs_to_go(
     terrain: TerrainMap, costs: jax.Array, world: jax.Array, goal: jax.Array
 ) -> jax.Array:
     """`[P, n, n]`"""
-    each = parallel.vmap(_costs_to_go, (None, None, 0, 0), _TOGETHER)
+    each = parallel.vmap(_costs_to_go, (None, None, 0, 0), _together())
     return each(terrain, costs, world, goal)
+
+
+def _together() -> int:
+    """Goals, or worlds, that a device works at."""
+    return machine.together(cpu=1, accelerator=256)
 
 
 def _costs(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax import xla
+from vertiwm_jax import machine, xla
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.geometry import wrap
@@ -20,7 +20,6 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 _SURROUNDINGS = 4.0  # m
 _SWAYS = 13  # places that a pair of the circle may turn to
-_DRAWN_TOGETHER = 16  # random tasks
 
 
 class TaskError(UserError, ValueError):
@@ -179,8 +178,9 @@ def _draw(
         return Tasks(world, start[first], yaw[first], goal[first]), found
 
     world = jnp.arange(count, dtype=jnp.int32) % terrain.worlds
-    # In small batches, since each goes on until the last task of it is found.
-    return jax.lax.map(draw, (jax.random.split(key, count), world), batch_size=_DRAWN_TOGETHER)
+    # In batches, small ones on CPUs, since each goes on until the last task of it is found.
+    together = machine.together(cpu=16, accelerator=1024)
+    return jax.lax.map(draw, (jax.random.split(key, count), world), batch_size=together)
 
 
 @jax.jit
