@@ -1,10 +1,10 @@
-"""Errors that commands tell in one line."""
+"""Errors that commands print in one line."""
 
 
 class UserError(Exception):
-    """Something that a user can mend; the message names what was found, where, and the mend.
+    """An error that a user can correct; the message says what was found, where, and what to do.
 
-    The base of all such errors of this package.
+    Base class of all such errors of this package.
     """
 
 

@@ -1,7 +1,7 @@
 """How each quantity of a vehicle and of its ground grows with their size.
 
-By Froude's similarity: where lengths grow by a factor and times by its root, gravity, slopes,
-friction and density stay as they are, and the motion is the same but for its scale.
+Froude similarity: if lengths grow by a factor and times by its square root, then gravity, slopes,
+friction and density stay the same, and the motion is the same at another scale.
 """
 
 from dataclasses import is_dataclass, replace
@@ -25,7 +25,7 @@ POWER: dict[str, float] = {
 
 
 def scaled(quantities: Quantities, factor: float) -> Quantities:
-    """The same vehicle, soil or map, `factor` times as large; soils of a map with it."""
+    """The same vehicle, soil or map, `factor` times as large; the soils of a map are scaled too."""
     if factor == 1:
         return quantities
     changes = {}

@@ -4,8 +4,8 @@ Rotations and poses are `jaxlie` groups. Tangent vectors are ordered translation
 rotation second, as in the paper's Log (Eq. 3). Roll, pitch and yaw are
 R = Rz(yaw) Ry(pitch) Rx(roll): positive pitch is nose down.
 
-What every step of a model needs is written out by components (see `vector`): jaxlie's own products
-gather them from arrays, of which XLA makes a kernel each.
+Functions that every step of a model calls are written by components (see `vector`): jaxlie's own
+products gather components from arrays, and XLA makes a kernel of each.
 """
 
 import jax
@@ -51,7 +51,7 @@ def pose_from_rpy(position: jax.Array, rpy: jax.Array) -> jaxlie.SE3:
 
 
 def compose(first: jaxlie.SO3, second: jaxlie.SO3) -> jaxlie.SO3:
-    """The rotation first @ second, of unit length again."""
+    """The rotation first @ second, normalized."""
     (w, a), (u, b) = _parts(first), _parts(second)
     real, imaginary = w * u - a.dot(b), a.times(u).plus(b, w).plus(a.cross(b))
     scale = jax.lax.rsqrt(real**2 + imaginary.dot(imaginary))
@@ -59,7 +59,7 @@ def compose(first: jaxlie.SO3, second: jaxlie.SO3) -> jaxlie.SO3:
 
 
 def rotate(rotation: jaxlie.SO3, v: jax.Array) -> jax.Array:
-    """Vectors `[..., 3]` turned by a rotation."""
+    """Vectors `[..., 3]` rotated by a rotation."""
     return Axes.from_quaternion(rotation.wxyz).to_world(Vector.of(v)).stacked()
 
 
@@ -77,7 +77,7 @@ def exp(xi: jax.Array) -> jaxlie.SE3:
     """`[..., 6]` tangent (translation m, rotation rad) to a pose, exact to float32 rounding.
 
     `jaxlie.SE3.exp` replaces the left Jacobian by the rotation itself below 3e-3 rad, which
-    is wrong to first order: straight driving at 10 Hz lives there. Here the translation is
+    is wrong to first order. Straight driving at 10 Hz has such angles. Here the translation is
     v + a (w x v) + b (w x (w x v)) with a = (1 - cos t)/t^2, b = (t - sin t)/t^3 and their
     series near zero, so values and derivatives are exact at any angle.
     """

@@ -1,7 +1,7 @@
 """Several hosts that compute together: the same command on each, joined by `jax.distributed`.
 
-All of them do the same, from the same settings. Where they might come to differ, by a rounding or
-by what a user does, they agree; what is printed and kept is the first one's.
+All hosts compute the same from the same settings. Where they could differ, by a rounding or by what
+a user does, they exchange values and agree. Only the first host prints and keeps results.
 """
 
 import atexit
@@ -36,11 +36,11 @@ def command() -> str:
 
 
 def join(command: str) -> None:
-    """Makes this process, which runs a command, one of several if the environment says so.
+    """Joins this process, which runs a command, with others if the environment says so.
 
-    `JAX_COORDINATOR_ADDRESS` is HOST:PORT of the first one, `JAX_NUM_PROCESSES` how many they are
-    and `JAX_PROCESS_ID`, from 0, which this is; those that are not set are the cluster's, where it
-    is one that JAX knows (SLURM, Open MPI). Ends the process with one line where that fails.
+    `JAX_COORDINATOR_ADDRESS` is HOST:PORT of the first process, `JAX_NUM_PROCESSES` their number
+    and `JAX_PROCESS_ID`, from 0, the number of this one. Variables that are not set come from the
+    cluster, if JAX knows it (SLURM, Open MPI). If joining fails, the process ends with one line.
     """
     if not any(name in os.environ for name in _VARIABLES):
         return
@@ -72,29 +72,29 @@ def join(command: str) -> None:
 
 
 def is_first() -> bool:
-    """Whether this process is the one whose results are kept."""
+    """Whether this is the first process, whose results are kept."""
     return jax.process_index() == 0
 
 
 def on_any(flag: bool) -> bool:
-    """Whether the flag is set on any host; all have to ask."""
+    """Whether the flag is set on any host; all hosts have to call this."""
     return bool(np.any(multihost_utils.process_allgather(np.array(flag))))
 
 
 def of_first(tree: T) -> T:
-    """A pytree of NumPy arrays: those of the first host, which all have to ask for."""
+    """The first host's values of a pytree of NumPy arrays; all hosts have to call this."""
     return multihost_utils.broadcast_one_to_all(tree)
 
 
 def path_of_first(path: Path) -> Path:
-    """The path that the first host gives, which all have to ask for."""
+    """The first host's path; all hosts have to call this."""
     encoded = os.fsencode(path).ljust(_LONGEST_PATH, b"\0")
     sent = of_first(np.frombuffer(encoded, np.uint8))
     return Path(os.fsdecode(sent.tobytes().rstrip(b"\0")))
 
 
 def own(folder: Path) -> Path:
-    """`folder` on the first host; on others an empty one that goes at a process's regular end."""
+    """`folder` on the first host; on others an empty one, deleted when the process ends."""
     if is_first():
         return folder
     scratch = Path(tempfile.mkdtemp())
@@ -112,7 +112,7 @@ def own_copy(folder: Path) -> Path:
 
 
 def leave(status: int | str) -> NoReturn:
-    """Ends this process like `sys.exit`, but at once where others wait for it: so they learn it."""
+    """Ends this process like `sys.exit`, but at once where others wait, so that they notice."""
     if jax.process_count() == 1:
         sys.exit(status)
     if isinstance(status, str):
@@ -123,12 +123,12 @@ def leave(status: int | str) -> NoReturn:
 
 
 def without_keys(tree: Any) -> Any:
-    """A pytree with the data of random keys in their place, as NumPy and files know them."""
+    """The pytree with random keys replaced by their data, which NumPy and files can hold."""
     return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, tree)
 
 
 def with_keys(like: T, tree: Any) -> T:
-    """The inverse: random keys where `like` has some."""
+    """The inverse of `without_keys`; random keys are where `like` has them."""
     return jax.tree.map(lambda x, y: jax.random.wrap_key_data(y) if _is_key(x) else y, like, tree)
 
 

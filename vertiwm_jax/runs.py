@@ -31,9 +31,9 @@ class RunError(UserError):
 
 
 class Resumable(Protocol):
-    """Settings of a command whose runs can be gone on with, a dataclass.
+    """Settings, a dataclass, of a command whose runs can be resumed.
 
-    runs: folder of runs; resume: that of an earlier one.
+    runs: folder of runs; resume: folder of the run to resume.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
@@ -48,8 +48,8 @@ class Resumable(Protocol):
 class Run:
     """One run's folder: `config.yaml`, `metrics.jsonl`, TensorBoard events, and what doors add.
 
-    Made by `Run.create` and continued by `Run.open`. `outermost` is the folder to continue: that of
-    the run that this is a `part` of, or its own.
+    Made by `Run.create` and continued by `Run.open`. `outermost` is the folder to resume: that of
+    the run that this one is a `part` of, or its own.
     """
 
     def __init__(self, folder: Path, events: Events) -> None:
@@ -95,7 +95,7 @@ class Run:
     ) -> Self:
         """Create a run with these settings, or continue the one that they name from `step`.
 
-        Of several hosts only the first one's folder is there, others have theirs for the time.
+        Of several hosts only the first keeps a folder; the others have temporary ones.
         project: of Weights & Biases, which gets the metrics too; may raise `TrackingError`.
         """
         kept = dataclasses.replace(settings, resume=None)
@@ -180,7 +180,7 @@ class Run:
 
 
 class Progress:
-    """A bar with rate and time left on a terminal; elsewhere a plain line now and then.
+    """A progress bar with rate and time left on a terminal; elsewhere a plain line now and then.
 
     Use as a context manager and call `advance`.
     """
@@ -234,14 +234,14 @@ class _RateColumn(rich.progress.ProgressColumn):
 
 
 def _pace(rate: float) -> str:
-    """So many a second, or how long each takes."""
+    """The rate a second, or the time of each if that is slower than one a second."""
     return f"{1 / rate:,.0f} s each" if 0 < rate < 1 else f"{rate:,.0f}/s"
 
 
 def read_metrics(folder: str | Path) -> list[dict[str, float]]:
     """The lines of a run's `metrics.jsonl`, each with `step`, `wall_time` (s) and its scalars.
 
-    A torn last line, left by a machine that stopped in the middle of a write, is passed over.
+    An incomplete last line, left by a machine that stopped during a write, is ignored.
     A missing file or any other damaged line raises `RunError`.
     """
     path = Path(folder) / METRICS
@@ -271,7 +271,7 @@ def read_columns(folder: str | Path) -> dict[str, list[float]]:
 
 
 def csv_text(lines: Sequence[Mapping[str, Any]]) -> str:
-    """Lines of equal keys as CSV, with a head."""
+    """Rows with equal keys as CSV, with a header line."""
     table = io.StringIO()
     writer = csv.DictWriter(table, list(lines[0]))
     writer.writeheader()
@@ -303,9 +303,9 @@ def write_atomic(path: str | Path, data: bytes | str) -> None:
 
 @contextlib.contextmanager
 def new_content(path: str | Path) -> Iterator[Path]:
-    """A file to fill, which then replaces that at `path` as `write_atomic` does.
+    """A file to fill, which then replaces the one at `path`, like `write_atomic`.
 
-    For what can be written to files only.
+    For writers that need a file.
     """
     path = Path(path)
     with tempfile.TemporaryDirectory() as folder:
@@ -318,7 +318,7 @@ def new_content(path: str | Path) -> Iterator[Path]:
 def new_folder(path: str | Path) -> Iterator[Path]:
     """A folder to fill, which then becomes the new folder at `path` as a whole, or not at all.
 
-    One that is there already, or that cannot be made, raises `RunError`.
+    A folder that exists already, or that cannot be made, raises `RunError`.
     """
     path = Path(path)
     if path.exists():
@@ -336,7 +336,7 @@ def new_folder(path: str | Path) -> Iterator[Path]:
 
 
 def _append(path: Path, line: str) -> None:
-    """Append one line; a write that fails midway is taken back."""
+    """Append one line; a write that fails midway is undone."""
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_APPEND)
         try:

@@ -1,4 +1,4 @@
-"""Metrics as TensorBoard reads them."""
+"""Writes metrics as TensorBoard events."""
 
 import sys
 import time
@@ -36,7 +36,7 @@ class Events:
         self._writer.write_event(Event(wall_time=time.time(), step=step, session_log=restart))
 
     def log(self, step: int, wall_time: float, values: Mapping[str, float]) -> None:
-        """Records scalars, which are with the operating system on return."""
+        """Records scalars; they have been handed to the operating system on return."""
         for name, value in values.items():
             event = Event(wall_time=wall_time, step=step, summary=scalar(name, value))
             self._writer.write_event(event)

@@ -1,4 +1,4 @@
-"""Metrics of a run at Weights & Biases as well, where a project of it is named."""
+"""Sends the metrics of a run to Weights & Biases, if a project is named."""
 
 import dataclasses
 import json
@@ -25,9 +25,9 @@ def check(project: str) -> None:
 
 
 def begin(project: str, folder: Path, outermost: Path, settings: Any) -> "Tracker":
-    """A run of that project, gone on with if it is there; its files lie in `folder`.
+    """A run of that project, continued if it exists; its files lie in `folder`.
 
-    outermost: folder of the run that this is a part of, or its own; its name is that of the group.
+    outermost: folder of the run that this is a part of, or its own; its name names the group.
     settings: a dataclass. `TrackingError` where Weights & Biases refuses.
     """
     import wandb

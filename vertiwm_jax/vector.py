@@ -1,7 +1,7 @@
 """Vectors as tuples of components.
 
-A trailing axis of length three defeats the vector units of a CPU: XLA then loops over three
-numbers at a time. With one array per component, every operation runs over all wheels of all
+With a trailing axis of length three XLA loops over three numbers at a time, which wastes the vector
+units of a CPU. With one array per component, every operation runs over all wheels of all
 vehicles at once. Components may have any equal shapes `[...]`.
 """
 

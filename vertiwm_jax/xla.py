@@ -1,4 +1,4 @@
-"""Options of XLA, the compiler. They come and go with its versions: what it lacks is left out."""
+"""Options of XLA, the compiler. Options that the installed version does not know are left out."""
 
 import functools
 import os
@@ -23,7 +23,7 @@ def left_out() -> list[str]:
 
 
 def add_flags(flags: Mapping[str, int | str]) -> None:
-    """Adds flags that are not there yet to `XLA_FLAGS`, which JAX reads when it starts.
+    """Adds flags that are not set yet to `XLA_FLAGS`, which JAX reads when it starts.
 
     An unknown flag would end the process. So another process tries them first, in 0.2 s.
     """
@@ -38,9 +38,9 @@ def add_flags(flags: Mapping[str, int | str]) -> None:
 def brief_jit(function: Callable[..., T], **options: Any) -> Callable[..., T]:
     """`jax.jit` for a program that runs only briefly: it compiles in about half the time.
 
-    Its loops that depend on vector units run many times slower.
+    Loops that use vector units run many times slower in it.
 
-    options: those of `jax.jit`; `compiler_options` come on top of what makes it brief.
+    options: those of `jax.jit`; `compiler_options` are added to those that shorten compilation.
     """
     extra = options.pop("compiler_options", {})
 
@@ -56,7 +56,7 @@ def brief_jit(function: Callable[..., T], **options: Any) -> Callable[..., T]:
 
 
 def _accepts(flags: Iterable[str]) -> bool:
-    """Whether a process that reads these flags goes on."""
+    """Whether a process accepts these flags."""
     environment = {**os.environ, "XLA_FLAGS": " ".join(flags)}
     command = [sys.executable, "-c", _READ_FLAGS]
     return subprocess.run(command, env=environment, capture_output=True).returncode == 0
@@ -68,7 +68,7 @@ def _brief_options() -> dict[str, int]:
 
 
 def _knows(name: str, value: int) -> bool:
-    """Whether the compiler takes an option, which is tried."""
+    """Tries whether the compiler accepts an option."""
     try:
         jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
     except jax.errors.JaxRuntimeError:

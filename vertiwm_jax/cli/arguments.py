@@ -1,4 +1,4 @@
-"""What commands read of their command lines: frozen dataclasses, by tyro."""
+"""Reads command lines into frozen dataclasses, by tyro."""
 
 import argparse
 import dataclasses
@@ -32,8 +32,8 @@ def with_file(
 ) -> T:
     """Read a command line: `[--config NAME or FILE] [--any.field VALUE] [--verbose]`.
 
-    `--config` replaces `default_file`; a name is that of a file that comes along. Every field can
-    then be set by its dotted name, with dashes or underscores. Bad input ends the process with
+    `--config` replaces `default_file`; a name is that of a file that the package ships. Every field
+    can then be set by its dotted name, with dashes or underscores. Bad input ends the process with
     status 2 and an error that names the file or option.
     """
     first = argparse.ArgumentParser(prog=f"vertiwm {name}", add_help=False, allow_abbrev=False)
@@ -73,7 +73,7 @@ def with_file(
 
 
 def resumable(cls: type[T], file: str, name: str, words: Sequence[str]) -> T:
-    """`with_file` of the one named `file` that comes along, or of the run to `--resume`.
+    """`with_file` with the shipped `file`, or with the configuration of the run to `--resume`.
 
     cls: has a field `resume`, the folder of a run, or None.
     """

@@ -1,4 +1,4 @@
-"""The built-in simulator as a source of drives."""
+"""The built-in simulator behind the interface of simulators outside jit."""
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ class _Moving:
 class BuiltIn:
     """A vehicle on the selected world of a map, compiled once for all maps of one size.
 
-    Obstacles are no hindrance. vehicle: the HMMWV by default.
+    Obstacles are ignored. vehicle: the HMMWV by default.
     """
 
     def __init__(self, terrain: TerrainMap, vehicle: Vehicle | None = None) -> None:
