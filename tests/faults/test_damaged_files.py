@@ -35,7 +35,7 @@ def good(tmp_path):
     """A map that can be read."""
     heights = 5 + np.random.default_rng(0).random((21, 21))
     files.save(terrain_map.build(heights, np.full((4, 4), GRASS)), tmp_path / "map.npz")
-    files.load(tmp_path / "map.npz")
+    files.load_map(tmp_path / "map.npz")
     return tmp_path / "map.npz"
 
 
@@ -91,7 +91,7 @@ def of_a_later_version(whole):
 )
 def test_a_damaged_map_is_refused(good, damage):
     good.write_bytes(damage(good.read_bytes()))
-    message = refusal(lambda: files.load(good), MapError)
+    message = refusal(lambda: files.load_map(good), MapError)
     assert message.startswith(f"{good}: file: expected an .npz map")
 
 
@@ -101,21 +101,21 @@ def test_a_byte_anywhere_in_a_map_may_be_wrong(good):
         data = bytearray(whole)
         data[place] ^= FLIPPED
         good.write_bytes(data)
-        refusal(lambda: files.load(good), MapError)
+        refusal(lambda: files.load_map(good), MapError)
 
 
 def test_a_map_may_be_cut_off_anywhere(good):
     whole = good.read_bytes()
     for length in range(1, len(whole), 37):
         good.write_bytes(whole[:length])
-        assert "file: expected an .npz map" in refusal(lambda: files.load(good), MapError)
+        assert "file: expected an .npz map" in refusal(lambda: files.load_map(good), MapError)
 
 
 @pytest.mark.parametrize("name", ["elevation", "patch_class", "obstacles", "origin", "meta"])
 def test_a_map_may_have_other_names(good, name):
     arrays = dict(np.load(good))
     np.savez(good, **{f"the_{key}" if key == name else key: x for key, x in arrays.items()})
-    assert f"{good}: {name}: expected" in refusal(lambda: files.load(good), MapError)
+    assert f"{good}: {name}: expected" in refusal(lambda: files.load_map(good), MapError)
 
 
 def meta(whole, **changes):
@@ -144,7 +144,7 @@ def test_what_a_map_holds_may_be_of_another_type(good, case):
     name, changed = OF_ANOTHER_TYPE[case]
     arrays = dict(np.load(good))
     np.savez(good, **arrays | {name: changed(arrays)})
-    message = refusal(lambda: files.load(good), MapError)
+    message = refusal(lambda: files.load_map(good), MapError)
     assert message.startswith(f"{good}: ")
 
 

@@ -29,7 +29,7 @@ def built(folder, origin):
 
 def saved(folder, origin):
     files.save(built(folder, origin), folder / "map.npz")
-    return files.load(folder / "map.npz")
+    return files.load_map(folder / "map.npz")
 
 
 def of_a_bag(folder, origin):

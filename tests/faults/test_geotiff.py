@@ -137,11 +137,8 @@ def test_other_compressions_are_read_or_refused(tmp_path):
         np.testing.assert_array_equal(terrain.elevation[0], RAMP)
 
 
-@pytest.mark.parametrize("setting", [{"origin": (100.0, 250.0)}, {"height_offset": -400.0}])
-@fault(TypeError, "heights in a file can be placed neither on the plane nor in height")
-def test_a_height_map_can_be_placed(tmp_path, setting):
-    path = write(tmp_path / "a.tif", scale(1.0, 1.0), RAMP + 400 * ("height_offset" in setting))
-    terrain = files.from_heightmap(path, 1.0, **setting)
-    origin = setting.get("origin", (-(SIZE - 1) / 2, (SIZE - 1) / 2))
-    np.testing.assert_array_equal(terrain.origin, origin)
-    np.testing.assert_allclose(terrain.elevation[0], RAMP, atol=1e-4)
+def test_a_height_map_can_be_placed(tmp_path):
+    path = write(tmp_path / "a.tif", scale(1.0, 1.0), RAMP + 400)
+    terrain = files.from_heightmap(path, 1.0, origin=(100.0, 250.0))
+    np.testing.assert_array_equal(terrain.origin, (100, 250))
+    np.testing.assert_allclose(terrain.elevation[0], RAMP + 400, atol=1e-4)

@@ -67,7 +67,7 @@ def test_drives_are_read_as_recorded(collected, maps):
     drives, terrain = dataset.load(collected, "train")
     assert drives.state.shape == (40, STEPS + 1, 12) and terrain.worlds == 2
     assert np.all(drives.length == STEPS)
-    np.testing.assert_array_equal(terrain.elevation, files.load(maps).elevation)
+    np.testing.assert_array_equal(terrain.elevation, files.load_map(maps).elevation)
     assert all(getattr(drives.auxiliary, name) is not None for name in schema.AUXILIARY)
     assert set(np.unique(drives.wheel_class)) == {GRASS, SAND}
     control = drives.control.reshape(-1, 2)
@@ -156,7 +156,7 @@ def test_drives_that_end_early_are_tried_again(maps, monkeypatch):
 
     monkeypatch.setattr(collection, "record", short)
     command = collect.Collect(output=maps, seconds=1.0)
-    task = collect.Task(command, hmmwv(), None, files.load(maps), world=0, drive=0)
+    task = collect.Task(command, hmmwv(), None, files.load_map(maps), world=0, drive=0)
     assert len(collect.record(task).control) == 3 and len(set(tried)) == 6
     with pytest.raises(SimulatorError, match="world 0: drive 0: expected a step or more"):
         collect.record(task)
@@ -189,7 +189,7 @@ class Scripted:
 def test_endings(maps, tmp_path, index, value, ending, length):
     states = np.zeros((6, 12))
     states[3:, index] = value
-    level = files.load(maps / "map_0.npz")
+    level = files.load_map(maps / "map_0.npz")
     pilot = excitation.sinusoids(np.random.default_rng(0), 5, 0.3725)
     drive = collection.record(Scripted(states), level, (0, 0, 0), pilot, 5)
     assert (drive.ending, len(drive.control), len(drive.observations)) == (
@@ -242,7 +242,7 @@ class Ahead:
 
 @pytest.mark.parametrize("eyes", [None, choice.eyes()], ids=["arcs", "embeddings"])
 def test_a_policy_drives_from_goal_to_goal(maps, eyes):
-    terrain = files.load(maps / "map_0.npz")
+    terrain = files.load_map(maps / "map_0.npz")
     config = NavigationConfig(speed_range=(0.0, 5.0), embeddings=eyes is not None)
     size = OBSERVATION_SIZE + (math.prod(EMBEDDING_SHAPE) if eyes else 0)
     policy = jax.tree_util.Partial(AtGoal(size))

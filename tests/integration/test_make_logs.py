@@ -28,8 +28,8 @@ def test_logs_of_a_rover_are_imported_as_they_were_recorded(recorded, tmp_path, 
     # 25 drives of 4 s take 4 s over the root of ten each.
     assert printed[0].startswith("0.5 minutes of logs")
     (command,) = (line for line in printed if "import_drives" in line)
-    small = files.load(next((logs / "maps").glob("*.npz")))
-    known = files.load(next((recorded / "maps").glob("*.npz")))
+    small = files.load_map(next((logs / "maps").glob("*.npz")))
+    known = files.load_map(next((recorded / "maps").glob("*.npz")))
     np.testing.assert_allclose(10 * small.resolution, known.resolution)
     words = command.split("vertiwm_jax.import_drives ")[1].replace("DRIVES", str(tmp_path))
     door("import_drives")(words.split())

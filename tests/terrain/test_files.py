@@ -53,7 +53,7 @@ def assert_same(a, b):
 
 
 def test_load_reads_a_map_of_the_drives(tmp_path):
-    terrain = files.load(write_drive_map(tmp_path / "a.npz"))
+    terrain = files.load_map(write_drive_map(tmp_path / "a.npz"))
     assert terrain.worlds == 1 and terrain.semantic.shape == (1, 4, 4)
     assert terrain.friction[0, 0, 0] == 0 and terrain.friction[0, 0, 1] == 0.5
     snow = STANDARD.names.index("snow")
@@ -66,20 +66,20 @@ def test_load_reads_a_map_of_the_drives(tmp_path):
 def test_a_folder_is_stacked_by_name(tmp_path):
     for name, height in (("b", 2), ("a", 1), ("c", 3)):
         write_drive_map(tmp_path / f"{name}.npz", elevation=np.full((33, 33), height, np.float32))
-    np.testing.assert_array_equal(files.load(tmp_path).elevation[:, 0, 0], [1, 2, 3])
+    np.testing.assert_array_equal(files.load_map(tmp_path).elevation[:, 0, 0], [1, 2, 3])
     write_drive_map(tmp_path / "d.npz", elevation=np.ones((17, 33), np.float32))
     with pytest.raises(MapError, match=r"d.npz: semantic: expected square cells"):
-        files.load(tmp_path)
+        files.load_map(tmp_path)
     small = {"elevation": np.ones((17, 17), np.float32), "obstacles": np.zeros((0, 5))}
     write_drive_map(tmp_path / "d.npz", **small)
     with pytest.raises(MapError, match=r"d.npz: elevation: expected shape .* as in .*a.npz"):
-        files.load(tmp_path)
+        files.load_map(tmp_path)
 
 
 def test_save_and_load_round_trip(tmp_path):
-    first = files.load(write_drive_map(tmp_path / "a.npz"))
+    first = files.load_map(write_drive_map(tmp_path / "a.npz"))
     files.save(first, tmp_path / "b.npz")
-    assert_same(files.load(tmp_path / "b.npz"), first)
+    assert_same(files.load_map(tmp_path / "b.npz"), first)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "b.npz"]
 
 
@@ -96,11 +96,11 @@ def test_save_keeps_the_selected_world_and_classes_of_ones_own(tmp_path):
         for height in (-1, 2)
     ]
     files.save(terrain_map.stack(worlds).select(1), tmp_path / "moon.npz")
-    assert_same(files.load(tmp_path / "moon.npz"), worlds[1])
+    assert_same(files.load_map(tmp_path / "moon.npz"), worlds[1])
 
 
 def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
-    terrain = files.load(write_drive_map(tmp_path / "a.npz"))
+    terrain = files.load_map(write_drive_map(tmp_path / "a.npz"))
     before = (tmp_path / "a.npz").read_bytes()
 
     def full(stream, **arrays):
@@ -134,22 +134,22 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
 def test_a_bad_map_is_named(tmp_path, changes, message):
     path = write_drive_map(tmp_path / "bad.npz", **changes)
     with pytest.raises(MapError, match=r"bad\.npz: " + message):
-        files.load(path)
+        files.load_map(path)
 
 
 def test_what_is_no_map_is_named(tmp_path):
     (tmp_path / "text.npz").write_text("hello")
     with pytest.raises(MapError, match=r"text.npz: file: expected an .npz map"):
-        files.load(tmp_path / "text.npz")
+        files.load_map(tmp_path / "text.npz")
     whole = write_drive_map(tmp_path / "cut.npz").read_bytes()
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(MapError, match=r"cut.npz: file: expected an .npz map"):
-        files.load(tmp_path / "cut.npz")
+        files.load_map(tmp_path / "cut.npz")
     with pytest.raises(MapError, match=r"absent.npz: file: .*no such file"):
-        files.load(tmp_path / "absent.npz")
+        files.load_map(tmp_path / "absent.npz")
     (tmp_path / "empty").mkdir()
     with pytest.raises(MapError, match=r"empty: folder: expected one .npz map or more"):
-        files.load(tmp_path / "empty")
+        files.load_map(tmp_path / "empty")
 
 
 RAMP = np.linspace(0, 65535, 21 * 31).reshape(21, 31).astype(np.uint16)

@@ -67,7 +67,7 @@ def make_logs(command: MakeLogs) -> tuple[float, list[str]]:
             rows = _rows(arrays, driven.scale, command.noise, rng)
             rows_written += len(rows)
             runs.write_atomic(unfinished / f"{source.stem}.csv", _text(rows))
-            terrain = files.load(schema.find_map(source, meta["map"]))
+            terrain = files.load_map(schema.find_map(source, meta["map"]))
             small = froude.scaled(terrain, 1 / driven.scale)
             files.save(small, unfinished / "maps" / source.name)
         configuration.save(_settings(driven), unfinished / "settings.yaml")

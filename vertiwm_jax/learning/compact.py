@@ -78,7 +78,7 @@ def write(source: Path, destination: Path) -> dict[str, int]:
         arrays, meta = schema.read(path)
         ground = schema.find_map(path, meta["map"])
         if ground not in maps:
-            maps[ground] = files.load(ground)
+            maps[ground] = files.load_map(ground)
         if "wheel_class" in arrays:
             schema.check_classes(path, arrays["wheel_class"], len(maps[ground].class_names))
         runs.write_atomic(_target(path, source, destination), _archive(arrays, meta))

@@ -139,7 +139,7 @@ def split_worlds(drives: Drives, every: int) -> tuple[Drives, Drives]:
 def _read(path: Path) -> tuple[dict[str, np.ndarray], TerrainMap]:
     """The arrays of all drives of a file and its map."""
     arrays, meta = schema.read(path)
-    terrain = files.load(schema.find_map(path, meta["map"]))
+    terrain = files.load_map(schema.find_map(path, meta["map"]))
     if "wheel_class" not in arrays:
         wheels = np.asarray(meta["vehicle"]["wheels_in_body_xy"], np.float32)
         arrays["wheel_class"] = _look_up_classes(terrain, arrays["state"], wheels)

@@ -31,23 +31,6 @@ _SOIL_FIELDS = {
 _NO_DATA = 42113  # GDAL's tag of the value that stands for none
 
 
-def load(path: str | Path) -> TerrainMap:
-    """The world in a `.npz` map, or those of a folder of them, stacked in the order of names.
-
-    Soils come from the file; what it does not say of a soil (its unit weight) comes from the
-    preset of the same name. Raises `MapError` naming the file and the field.
-    """
-    path = Path(path)
-    if not path.exists():
-        raise MapError(str(path), "file", "an .npz map, or a folder of them", "no such file")
-    if path.is_dir():
-        files = sorted(path.glob("*.npz"))
-        if not files:
-            raise MapError(str(path), "folder", "one .npz map or more", "none")
-        return stack([_load_world(file) for file in files], [str(file) for file in files])
-    return _load_world(path)
-
-
 def load_map(path: str | Path, *, scale: float = 1.0, obstacles: bool = True) -> TerrainMap:
     """Loads a map, or all maps of a folder.
 
@@ -57,19 +40,31 @@ def load_map(path: str | Path, *, scale: float = 1.0, obstacles: bool = True) ->
         obstacles: whether the rocks and trees of the maps stand there.
 
     Returns:
-        W worlds, stacked in the order of their names, of which the first is selected.
+        W worlds, stacked in the order of their names, of which the first is selected. Soils come
+        from the file; what it does not say of a soil (its unit weight) comes from the preset of
+        the same name.
 
     Raises:
         MapError: a file is missing or malformed; the message names it and the field.
     """
     path = Path(path)
-    terrain = vertibench.load(path) if (path / "envs").is_dir() else load(path)
+    if not path.exists():
+        raise MapError(str(path), "file", "an .npz map, or a folder of them", "no such file")
+    if (path / "envs").is_dir():
+        terrain = vertibench.load(path)
+    elif path.is_dir():
+        files = sorted(path.glob("*.npz"))
+        if not files:
+            raise MapError(str(path), "folder", "one .npz map or more", "none")
+        terrain = stack([_load_world(file) for file in files], [str(file) for file in files])
+    else:
+        terrain = _load_world(path)
     terrain = froude.scaled(terrain, scale)
     return terrain if obstacles else replace(terrain, obstacles=terrain.obstacles[:, :0])
 
 
 def save(terrain: TerrainMap, path: str | Path) -> None:
-    """Writes the selected world in the layout that `load` reads; whole or not at all."""
+    """Writes the selected world in the layout that `load_map` reads; whole or not at all."""
     path = Path(path)
     world = int(terrain.world)
     elevation, semantic, friction, obstacles = (
@@ -119,13 +114,23 @@ def from_heightmap(
     class_image: str | Path | None = None,
     default_class: str = "grass",
     classes: GroundClasses = STANDARD,
+    origin: tuple[float, float] | None = None,
 ) -> TerrainMap:
-    """A map from heights in a 16-bit PNG, `.npy` or GeoTIFF file; row 0 is north.
+    """Makes a map from heights in a 16-bit PNG, `.npy` or GeoTIFF file; row 0 is north.
 
-    resolution: m between pixels. height_range: heights in m of the darkest and the brightest
-    integer a pixel can hold; without it, values are metres. class_image: an 8-bit image of ids or
-    an RGB image of the palette's colours, over the same extent at any resolution; without it, all
-    ground is `default_class`. Raises `MapError` naming the file and the field.
+    Args:
+        path: the file.
+        resolution: m between pixels.
+        height_range: heights in m of the darkest and the brightest integer that a pixel can hold;
+            without it, values are metres.
+        class_image: an 8-bit image of ids, or an RGB image of the palette's colours, over the same
+            extent at any resolution.
+        default_class: all ground, where there is no such image.
+        classes: what ids and colours stand for.
+        origin: x, y of the first pixel, m; the map is centred by default.
+
+    Raises:
+        MapError: a file is missing or malformed; the message names it and the field.
     """
     name = str(path)
     if not resolution > 0:
@@ -152,6 +157,7 @@ def from_heightmap(
         heights,
         semantic,
         resolution=resolution,
+        origin=origin,
         classes=classes,
         name=name if class_image is None else f"{name} with {class_image}",
     )

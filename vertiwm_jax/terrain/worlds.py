@@ -8,14 +8,14 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import cycle, islice, product
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax import froude, xla
-from vertiwm_jax.config import settings
+from vertiwm_jax.config import AtLeastOne, CountOrZero, Share, settings
 from vertiwm_jax.terrain.classes import FIRST_DEFORMABLE, FRICTION_LIMITS, STANDARD
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -77,34 +77,25 @@ class WorldConfig:
     obstructed: probability that a world has obstacles.
     """
 
-    difficulties: tuple[Difficulty | float, ...] = ("low", "mid", "high")
-    kinds: tuple[Kind, ...] = ("rigid", "deformable", "mixed")
-    rocks: int = 0
-    trees: int = 0
-    obstructed: float = 1.0
+    difficulties: Annotated[tuple[Difficulty | float, ...], AtLeastOne] = ("low", "mid", "high")
+    kinds: Annotated[tuple[Kind, ...], AtLeastOne] = ("rigid", "deformable", "mixed")
+    rocks: CountOrZero = 0
+    trees: CountOrZero = 0
+    obstructed: Share = 1.0
     relief: ReliefConfig = ReliefConfig()
 
     def check(self) -> None:
         for difficulty in self.difficulties:
             if isinstance(difficulty, str) and difficulty not in MEDIAN_SLOPE_DEG:
-                raise ValueError(
-                    f"WorldConfig: difficulties: expected one of {', '.join(MEDIAN_SLOPE_DEG)} or "
-                    f"a median slope in degrees, found {difficulty!r}"
-                )
+                names = ", ".join(MEDIAN_SLOPE_DEG)
+                expected = f"one of {names} or a median slope in degrees"
+                raise ValueError(f"difficulties: expected {expected}, found {difficulty!r}")
             if not isinstance(difficulty, str) and not 0 <= difficulty < 60:
-                raise ValueError(
-                    f"WorldConfig: difficulties: expected a median slope of 0 to 60 deg, "
-                    f"found {difficulty}"
-                )
+                expected = "a median slope of 0 to 60 deg"
+                raise ValueError(f"difficulties: expected {expected}, found {difficulty}")
         for kind in self.kinds:
             if kind not in _KINDS:
-                raise ValueError(
-                    f"WorldConfig: kinds: expected one of {', '.join(_KINDS)}, found {kind!r}"
-                )
-        if not (self.difficulties and self.kinds):
-            raise ValueError("WorldConfig: expected a difficulty and a kind or more, found none")
-        if not 0 <= self.obstructed <= 1:
-            raise ValueError(f"WorldConfig: obstructed: expected 0 to 1, found {self.obstructed}")
+                raise ValueError(f"kinds: expected one of {', '.join(_KINDS)}, found {kind!r}")
 
 
 def labels(config: WorldConfig, count: int) -> list[tuple[Difficulty | float, Kind]]:
