@@ -254,6 +254,22 @@ def test_left_and_right_are_the_same():
     np.testing.assert_allclose(one.vector, other.vector * flip, atol=0.02)
 
 
+def test_every_wheel_may_be_of_its_own():
+    names = ("wheel_radius", "wheel_width", "wheel_inertia", "wheel_torque", "brake_torque")
+    own = {name: jnp.broadcast_to(getattr(VEHICLE, name), 4) for name in names}
+    params = replace(PARAMS, vehicle=replace(VEHICLE, **own))
+    terrain = ground(waves)
+    expected, found = (
+        drive(terrain, at_rest(terrain), 3.0, 0.2, which) for which in (PARAMS, params)
+    )
+    np.testing.assert_allclose(found.state.vector, expected.state.vector, atol=1e-4)
+    at_the_back = own["wheel_torque"] * jnp.array([0.0, 0.0, 1.0, 1.0])
+    driven = replace(params, vehicle=replace(params.vehicle, wheel_torque=at_the_back))
+    level = ground()
+    pull = drive(level, at_rest(level), 3.0, params=driven).history.force[5, :, 1]
+    assert (pull[:2] < 1).all() and (pull[2:] > 100).all()
+
+
 def test_turning_and_moving_the_world_turns_and_moves_the_drive():
     centre = np.array([100.0, -40.0])
     soil = ground(waves, MUD)

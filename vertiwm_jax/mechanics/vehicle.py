@@ -25,7 +25,7 @@ class Vehicle:
     """A vehicle with independent suspension and all-wheel drive; SI units, body axes.
 
     Wheels are front-left, front-right, rear-left, rear-right. The body origin lies between the
-    wheel centres of the design position.
+    wheel centres of the design position. To the simulator, what is `[]` of a wheel may be `[4]`.
 
     mass: `[]` kg, wheels included.
     centre_of_mass: `[3]` m.
