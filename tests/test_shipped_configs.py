@@ -6,8 +6,8 @@ import pytest
 
 from vertiwm_jax import config
 from vertiwm_jax.cli.compare import CompareConfig
-from vertiwm_jax.cli.fit import FitConfig
 from vertiwm_jax.importers.settings import ImportSettings
+from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining

@@ -10,8 +10,10 @@ if TYPE_CHECKING:
     from vertiwm_jax.env.agent import Agent as Agent
     from vertiwm_jax.env.navigation import NavigationEnv as NavigationEnv
     from vertiwm_jax.env.navigation import make_env as make_env
+    from vertiwm_jax.evaluation.navigation import evaluate as evaluate
     from vertiwm_jax.evaluation.prediction import prediction_errors as prediction_errors
     from vertiwm_jax.learning.dataset import load_drives as load_drives
+    from vertiwm_jax.learning.experiment import fit as fit
     from vertiwm_jax.mechanics.kinematic import place as place
     from vertiwm_jax.mechanics.vehicle import Vehicle as Vehicle
     from vertiwm_jax.mechanics.vehicle import load_vehicle as load_vehicle
@@ -39,6 +41,8 @@ _PUBLIC = {
     "TerrainMap": "terrain.map",
     "Vehicle": "mechanics.vehicle",
     "VehicleState": "state",
+    "evaluate": "evaluation.navigation",
+    "fit": "learning.experiment",
     "load_drives": "learning.dataset",
     "load_map": "terrain.files",
     "load_model": "world_model.choice",

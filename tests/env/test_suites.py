@@ -56,6 +56,17 @@ def test_the_suite_of_a_map_is_that_of_its_slope_and_obstacles():
     assert suites.suites(terrain) == ["easy", "hard", "obstacles", "hard, obstacles"]
 
 
+@pytest.mark.parametrize(("count", "every"), [(1, 5), (3, 0)])
+def test_one_map_or_all_are_tested_on_where_trained(tmp_path, count, every):
+    for i in range(count):
+        files.save(plane(float(i)), tmp_path / f"map_{i}.npz")
+    config = replace(CONFIG, held_out_every=every)
+    train, held_out = suites.grounds(config, tmp_path, jax.random.key(0))
+    assert train.worlds == held_out.worlds == count
+    with pytest.raises(ValueError, match="held_out_every: expected 0, or 2 and more"):
+        replace(CONFIG, held_out_every=1)
+
+
 def test_every_so_manieth_map_is_held_out(tmp_path):
     slopes = np.arange(7.0)
     for i, slope in enumerate(slopes):

@@ -12,8 +12,9 @@ from doors import door, refusal
 from faults.border import fault
 from learning import recordings
 
-from vertiwm_jax.cli import evaluate, fit
+from vertiwm_jax.cli import evaluate
 from vertiwm_jax.learning import dataset
+from vertiwm_jax.learning import experiment as fitting
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.terrain import files
@@ -52,7 +53,7 @@ def test_few_drives_are_split_by_share(tmp_path):
 @fault(Begun, "that nothing can be tested on is told when the first model has been fitted")
 def test_too_few_drives_are_refused_before_a_run_begins(tmp_path, monkeypatch):
     recordings.write(tmp_path, **recordings.drives(count=1))
-    monkeypatch.setattr(fit.Run, "begin", begin)
+    monkeypatch.setattr(fitting.Run, "begin", begin)
     assert str(tmp_path) in refusal(door("fit"), "--data", tmp_path, "--runs", tmp_path / "runs")
 
 

@@ -23,13 +23,13 @@ from rl.probes import ProbeParams, Target
 
 from vertiwm_jax import cli, runs
 from vertiwm_jax import config as configuration
-from vertiwm_jax.cli.fit import FitConfig
 from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.learning import pipeline, stages
+from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.learning.fitting import Fit, FitInputs, Problem, merge
 from vertiwm_jax.learning.stages import Inputs
 from vertiwm_jax.networks.soil_predictor import BOUNDS, SoilPredictor

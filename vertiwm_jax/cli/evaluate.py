@@ -12,7 +12,6 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
 from vertiwm_jax.adaptation.soil_filter import SoilFilter
 from vertiwm_jax.cli import arguments
-from vertiwm_jax.cli.fit import FitConfig
 from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, settings
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env.controllers import REFERENCE
@@ -30,6 +29,7 @@ from vertiwm_jax.evaluation import (
 from vertiwm_jax.evaluation.external import Arena
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
+from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import chrono_like
@@ -290,7 +290,8 @@ def _navigate(command: Navigation) -> None:
         policies = {REFERENCE: policies[REFERENCE]}
     with processes.simulating(command.jobs) as mapped:
         judge = external.judge_in(command.simulator, config, terrain, mapped)
-        groups = report.drive(test.env, test.params, policies, config.key("testing"), judge)
+        given, key = bool(config.worlds), config.key("testing")
+        groups = report.drive(test.env, test.params, policies, key, judge, given)
     print(f"\n{report.markdown(groups, REFERENCE)}")
     if command.output:
         radius = config.navigation.goal_radius
@@ -303,6 +304,7 @@ def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:
     grounds = replace(config.ground, **{name: value for name, value in asked.items() if value})
     if command.worlds:
         grounds = replace(grounds, obstacles=command.obstacles)
+        config = replace(config, worlds=command.worlds)
     if command.vehicle is not None:
         config = replace(config, vehicle=command.vehicle)
     if command.reveal_range is not None:

@@ -229,7 +229,7 @@ def make_env(
     terrain: TerrainMap | None = None,
     model: Imagined = "builtin",
     *,
-    vehicle: str = HMMWV,
+    vehicle: str | Vehicle = HMMWV,
     weights: str | Path | None = None,
     config: NavigationConfig = NavigationConfig(),
     pairs: int = 10,
@@ -240,8 +240,8 @@ def make_env(
     Args:
         terrain: W worlds; by default two procedural ones of each suite that policies are tested on.
         model: what moves the vehicle, see `load_model`.
-        vehicle: name of a vehicle that comes along, or a YAML file of one; learned models move
-            the one that they were fitted to.
+        vehicle: a vehicle, the name of one that comes along, or a YAML file of one; learned models
+            move the one that they were fitted to.
         weights: folder of a fitted model; the one that comes along by default.
         config: what the task asks.
         pairs: tasks in a world, each from one point of a circle to the opposite one.
@@ -257,7 +257,7 @@ def make_env(
         TaskError: a task cannot be driven on the map.
         ConfigError, CheckpointError: there is no such vehicle, or no such model.
     """
-    driven = load_vehicle(vehicle)
+    driven = load_vehicle(vehicle) if isinstance(vehicle, str) else vehicle
     if terrain is None:
         terrain = suites.suite_worlds(GroundConfig(suite_worlds=2), jax.random.key(seed))
     dynamics, params = load_model(model, weights, vehicle=driven, embeddings=config.embeddings)

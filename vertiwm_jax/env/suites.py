@@ -1,5 +1,6 @@
 """Worlds to train on, worlds kept for tests, and the tasks on both."""
 
+import logging
 import math
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,6 +15,8 @@ from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.terrain import files, worlds
 from vertiwm_jax.terrain.map import TerrainMap, stack
 from vertiwm_jax.terrain.worlds import MEDIAN_SLOPE_DEG, WorldConfig
+
+_log = logging.getLogger(__name__)
 
 Suite = Literal["easy", "hard", "obstacles"]
 SUITES: dict[Suite, WorldConfig] = {
@@ -37,7 +40,8 @@ class GroundConfig:
     suite_worlds: Count = 6
     """Number of worlds of each suite."""
     held_out_every: CountOrZero = 5
-    """Every n-th of the given maps is kept for testing, not trained on."""
+    """Of given maps, every n-th is kept for testing. With 0, and of a single map, all are both
+    trained and tested on."""
     starts: CountOrZero = 1024
     """Number of random tasks to train on, besides those across the circle of every world."""
     pairs: Count = 10
@@ -46,6 +50,10 @@ class GroundConfig:
     """Largest turn of such a task about the circle to a more level start, rad; none by 0."""
     obstacles: bool = False
     """Whether given maps keep their rocks and trees; the paper drives without them."""
+
+    def check(self) -> None:
+        if self.held_out_every == 1:
+            raise ValueError("held_out_every: expected 0, or 2 and more to train on some, found 1")
 
 
 def grounds(
@@ -60,6 +68,9 @@ def grounds(
         training = worlds.generate(keys, config.training, scale)
         return training, suite_worlds(config, key, scale)
     terrain = files.load_map(path, scale=scale, obstacles=config.obstacles)
+    if terrain.worlds == 1 or not config.held_out_every:
+        _log.info("training and testing on the same %d map(s)", terrain.worlds)
+        return terrain, terrain
     if terrain.worlds < config.held_out_every:
         raise ConfigError(
             f"{path}: held_out_every: expected at most the {terrain.worlds} worlds found, "

@@ -5,10 +5,55 @@ import math
 from collections.abc import Mapping
 from typing import Self
 
+import jax
 import numpy as np
 
-from vertiwm_jax.env.episodes import NavigationResult
+from vertiwm_jax.env.agent import Agent, Policy
+from vertiwm_jax.env.episodes import NavigationResult, run_episodes
+from vertiwm_jax.env.navigation import make_env
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
+from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle
+from vertiwm_jax.rl.policy import Policy as Trained
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model.choice import Imagined
+
+
+def evaluate(
+    agent: Agent | Policy | Trained,
+    terrain: TerrainMap | None = None,
+    *,
+    model: Imagined = "builtin",
+    vehicle: str | Vehicle | None = None,
+    pairs: int = 10,
+    seed: int = 0,
+) -> NavigationResult:
+    """Tests how well an agent drives across maps.
+
+    Args:
+        agent: a trained policy, an agent, or any function of an observation and a key.
+        terrain: W worlds; by default two procedural ones of each of the three suites.
+        model: what moves the vehicle, see `load_model`.
+        vehicle: which it is; by default that of the policy's training, or the HMMWV.
+        pairs: tasks in a world.
+        seed: draws the default worlds, and decides what is random of the agent.
+
+    Returns:
+        W * `pairs` episodes: how they ended, their duration, tilt and path. `Summary.of` of this
+        module sums them up.
+
+    Raises:
+        TaskError: a task cannot be driven on the map.
+        ConfigError, CheckpointError: there is no such vehicle, or no such model.
+    """
+    config = NavigationConfig()
+    if isinstance(agent, Trained):
+        config, vehicle = agent.task, vehicle or agent.config.vehicle.vehicle
+        agent = agent.acting
+    env, task = make_env(
+        terrain, model, vehicle=vehicle or HMMWV, config=config, pairs=pairs, seed=seed
+    )
+    return run_episodes(env, task, agent, jax.random.key(seed))
 
 
 @dataclasses.dataclass(frozen=True)

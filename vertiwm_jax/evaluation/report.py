@@ -40,6 +40,7 @@ CURVES = {
     "explained_variance": "explained variance",
 }
 """What is drawn of a training, where it has that."""
+GIVEN_MAPS = "given maps"
 _log = logging.getLogger(__name__)
 
 
@@ -56,7 +57,8 @@ def after_training(trained: Trained) -> str:
     machine.forget_programs()  # Tests need the memory.
     test = experiment.test_environment(config, trained.held_out)
     policies = experiment.learned(config, folder) | config.baselines
-    groups = drive(test.env, test.params, policies, config.key("testing"))
+    given = trained.given or config.worlds is not None
+    groups = drive(test.env, test.params, policies, config.key("testing"), given=given)
     write(folder, groups, REFERENCE, test.params.terrain, config.navigation.goal_radius)
     return markdown(groups, REFERENCE)
 
@@ -67,8 +69,12 @@ def drive(
     policies: Mapping[str, Policy | Agent],
     key: jax.Array,
     judge: Judge = run_episodes,
+    given: bool = False,
 ) -> dict[str, Results]:
-    """Drives all tasks of the pool with each policy; the results by suite."""
+    """Drives all tasks of the pool with each policy; the results by suite.
+
+    given: whether the worlds are a user's own maps, which belong to no suite.
+    """
     _log.info("driving %d tasks on %d worlds ...", params.pool_size, params.terrain.worlds)
     results = {}
     for name, policy in policies.items():
@@ -76,7 +82,8 @@ def drive(
         results[name] = judge(env, params, policy, key)
         solved, seconds = int(np.sum(results[name].success)), time.perf_counter() - start
         _log.info("  %s: %d solved, compiled and driven in %.0f s", name, solved, seconds)
-    return by_suite(results, suites.suites(params.terrain))
+    of_worlds = [GIVEN_MAPS] * params.terrain.worlds if given else suites.suites(params.terrain)
+    return by_suite(results, of_worlds)
 
 
 def by_suite(results: Results, suites: Sequence[str]) -> dict[str, Results]:

@@ -318,6 +318,8 @@ class Trained:
     config: TrainConfig
     folder: Path
     held_out: TerrainMap
+    given: bool = False
+    """Whether these were given as arrays."""
 
 
 def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
@@ -327,7 +329,10 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
     the disk do not allow it, and `TrainingInterrupted` at Ctrl-C once all is saved.
     """
     keep_compiled(config.compile_cache)
-    config = replace(config, operands=config.multiplied)  # So that it goes on as it began.
+    # So that it goes on as it began, and is tested, from wherever that is.
+    paths = {name: getattr(config, name) for name in ("worlds", "weights")}
+    absolute = {name: path and path.absolute() for name, path in paths.items()}
+    config = replace(config, operands=config.multiplied, **absolute)
     _log.info("drawing worlds ...")
     terrain, pool, held_out = training_ground(config, given)
     machine.forget_programs()
@@ -365,7 +370,7 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
             keep,
         )
         keep(state)
-    return Trained(config, begun.folder, held_out)
+    return Trained(config, begun.folder, held_out, given is not None)
 
 
 def train(

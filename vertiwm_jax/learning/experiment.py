@@ -1,0 +1,118 @@
+"""A whole fit of the world model: its settings, `run`, and `fit` for programs."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from vertiwm_jax import config as configuration
+from vertiwm_jax.config import ConfigError, settings
+from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.learning import pipeline
+from vertiwm_jax.learning.pipeline import PipelineConfig
+from vertiwm_jax.runs import Run
+from vertiwm_jax.training import keep_compiled
+from vertiwm_jax.world_model import model
+from vertiwm_jax.world_model.choice import fitted
+from vertiwm_jax.world_model.model import VertiWMParams
+
+_log = logging.getLogger(__name__)
+
+
+@settings
+class FitConfig(PipelineConfig):
+    """Fit Verti-WM to recorded drives: autoencoders, both specialists, the gate."""
+
+    data: tuple[Path, ...] = (Path("data/open"),)
+    """Folders of drives, or of such folders named rigid, deformable and mixed."""
+    add: tuple[Path, ...] = ()
+    """Folders of more drives beside those, such as a policy has driven (`collect --policy`)."""
+    name: str = "fit"
+    """What the name of the run folder begins with; the date follows."""
+    seed: int = 0
+    """Decides everything that is random."""
+    runs: Path = Path("runs")
+    """Folder in which the folder of this run is made."""
+    resume: Path | None = None
+    """Folder of an earlier run to go on with; stages that have ended are not repeated."""
+    reuse: tuple[Path, ...] = ()
+    """Folders of earlier runs, whose stages are taken over where their inputs are the same."""
+    start: Path | None = None
+    """Folder of a fitted model to go on from, or `pretrained`: it is fitted further by open-loop
+    predictions; its encoders and constants stay. It may have fewer gates than `model.gates`."""
+    wandb: str | None = None
+    """Project of Weights & Biases that gets the metrics too; needs the package `wandb`."""
+    compile_cache: Path | None = None
+    """Folder that keeps compiled programs for later runs."""
+
+
+def run(config: FitConfig) -> Path:
+    """Fits all stages, or goes on with them; the folder of the run, with the model in `model`.
+
+    Tells by logging what it does. Raises `UserError` where settings, drives, an earlier run or the
+    disk do not allow it, and `TrainingInterrupted` at Ctrl-C once all is saved.
+    """
+    keep_compiled(config.compile_cache)
+    start = _start(config)
+    with Run.begin(config, config.name, project=config.wandb) as run:
+        _log.info("run folder %s", run.folder)
+        key = jax.random.key(config.seed)
+        folders = config.data + config.add
+        params = pipeline.fit(config, folders, key, run, config.reuse, start)
+        model.save(run.folder / "model", config.model, params)
+    return run.folder
+
+
+def fit(
+    drives: str | Path | Sequence[str | Path],
+    *,
+    config: str | Path = "fit_chrono",
+    start: str | Path | None = None,
+    runs: str | Path = "runs",
+    **settings: Any,
+) -> tuple[Dynamics, Params]:
+    """Fits Verti-WM to recorded drives.
+
+    Progress is logged; `logging.basicConfig(level="INFO")` shows it.
+
+    Args:
+        drives: a folder of drives, as `load_drives` reads them, or several.
+        config: name of settings that come along (`fit_chrono` for a new model, `fine_tune` to go
+            on from the pretrained one, ...), or a YAML file of them.
+        start: folder of a fitted model to go on from, or `pretrained`; by default what the settings
+            say.
+        runs: folder in which the folder of this run is made.
+        settings: fields of the settings to change (`seed`, `vehicle`, `model`, ...).
+
+    Returns:
+        The fitted model and its parameters; they are also in the folder `model` of the run.
+
+    Raises:
+        ConfigError: a setting is unknown or refused, or `start` is of another kind of model.
+        DataError, MapError: drives or their maps are malformed or too few.
+    """
+    chosen = configuration.load(FitConfig, configuration.find(config))
+    known = [field.name for field in fields(FitConfig)]
+    for name in settings:
+        if name not in known:
+            expected = configuration.choices(name, known)
+            raise ConfigError(f"{name}: unknown setting, expected {expected}")
+    data = [drives] if isinstance(drives, str | Path) else drives
+    changed = settings | {"data": tuple(map(Path, data)), "runs": Path(runs)}
+    changed |= {"start": Path(start)} if start else {}
+    found = fitted(run(replace(chosen, **changed)) / "model")
+    return found.get("vertiwm") or next(iter(found.values()))
+
+
+def _start(config: FitConfig) -> VertiWMParams | None:
+    """The parameters to go on from; `ConfigError` if they are of another model."""
+    if config.start is None:
+        return None
+    pretrained = config.start == Path("pretrained")
+    found, params = model.load(model.PRETRAINED if pretrained else config.start)
+    if found.gates > config.model.gates or replace(found, gates=config.model.gates) != config.model:
+        raise ConfigError(f"{config.start}: expected {config.model}, found {found}")
+    return params
