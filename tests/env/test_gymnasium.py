@@ -6,10 +6,10 @@ from env.worlds import bicycle_env, ground, hills, task
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
+import vertiwm_jax.gym
 from vertiwm_jax.env.gymnasium import NavigationGymEnv, NavigationVectorEnv
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
-from vertiwm_jax.env.termination import TerminationReason
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def test_single_ends_by_truncation_and_shows_the_world(short):
     env.reset(seed=3)
     ends = [env.step(np.array([1.0, 0.0], np.float32))[2:] for _ in range(3)]
     assert [end[:2] for end in ends] == [(False, False), (False, False), (False, True)]
-    assert ends[-1][2]["ending"] == TerminationReason.TIMED_OUT
+    assert ends[-1][2]["ending"] == "timed_out"
     picture = env.render()
     assert picture.shape == (512, 512, 3) and picture.dtype == np.uint8
     red = (picture == np.round(255 * np.array([0.8, 0.05, 0.05]))).all(-1)
@@ -71,7 +71,7 @@ def test_vector_resets_in_the_step_that_ends(short):
     assert not terminated.any() and truncated.all() and reward.shape == (4,)
     assert observation in env.observation_space
     assert info["_final_obs"].all() and not info["_ending"].any()
-    assert (info["final_info"]["ending"] == TerminationReason.TIMED_OUT).all()
+    assert (info["final_info"]["ending"] == "timed_out").all()
     starts = np.asarray(short[1].start_observation)
     for now, final in zip(observation, info["final_obs"], strict=True):
         assert (now == starts).all(-1).any() and not (final == starts).all(-1).any()
@@ -89,3 +89,15 @@ def test_vector_agrees_with_single(short):
         expected = step(jax.random.key(0), state, action[i], params)
         np.testing.assert_allclose(observation[i], expected[0], atol=1e-5)
         np.testing.assert_allclose(reward[i], expected[2], rtol=1e-4)
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_task_is_made_by_its_name():
+    settings = {"terrain": ground(hills()), "model": "bicycle", "pairs": 2}
+    single = gymnasium.make(vertiwm_jax.gym.NAME, **settings)
+    observation, _ = single.reset(seed=0)
+    assert observation in single.observation_space
+    assert single.step(single.action_space.sample())[4]["ending"] == "running"
+    many = gymnasium.make_vec(vertiwm_jax.gym.NAME, num_envs=3, **settings)
+    assert many.reset(seed=0)[0].shape == (3, *single.observation_space.shape)
+    assert many.step(many.action_space.sample())[4]["ending"].tolist() == ["running"] * 3

@@ -12,9 +12,11 @@ from gymnasium.vector.utils import batch_space
 from vertiwm_jax.env import render
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import TaskParams, TaskState
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.state import STEP_SECONDS
 
 FRAMES_PER_SECOND = round(1 / STEP_SECONDS)
+_ENDINGS = np.array([reason.name.lower() for reason in TerminationReason])
 
 
 def _spaces(env: NavigationEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -96,7 +98,7 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         observation, self._state, reward, terminated, info, truncated = _step(
             self._env, self._key, self._state, action, self._params
         )
-        info = {name: value.item() for name, value in info.items()}
+        info = {name: value.item() for name, value in _named(info).items()}
         return np.asarray(observation), reward.item(), bool(terminated), bool(truncated), info
 
     def render(self) -> np.ndarray | None:
@@ -156,6 +158,7 @@ class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         )
         # Copies, since arrays of JAX are read-only.
         reward, terminated, truncated, info = jax.tree.map(np.array, outcome)
+        info = _named(info)
         final_observation = info.pop("final_observation")
         del info["terminated"], info["truncated"]
         over = terminated | truncated
@@ -170,6 +173,11 @@ class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _next_key(self) -> jax.Array:
         self._key, key = jax.random.split(self._key)
         return key
+
+
+def _named(info: dict[str, Any]) -> dict[str, Any]:
+    """The same with endings by name, like "goal"."""
+    return info | {"ending": _ENDINGS[np.asarray(info["ending"])]}
 
 
 def _with_masks(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
