@@ -60,6 +60,7 @@ PUBLIC = {
         "load_drives",
         "learning.dataset.Drives",
         "prediction_errors",
+        "fit",
         "adaptation.soil_filter.SoilFilter",
     ),
     "The task": (
@@ -72,8 +73,12 @@ PUBLIC = {
         "env.gymnasium.NavigationGymEnv",
     ),
     "Policies and planners": (
+        "train",
+        "load_policy",
+        "Policy",
         "Agent",
         "MPPI",
+        "evaluate",
         "env.episodes.run_episodes",
         "env.episodes.NavigationResult",
     ),

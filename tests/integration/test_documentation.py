@@ -25,7 +25,7 @@ ELSEWHERE = ("rclpy",)
 """What stands in blocks that only run on a robot."""
 OPTIONAL = {"simulators.chrono": "pychrono", "stable_baselines3": "stable_baselines3"}
 """What a block that says so needs, and is skipped without."""
-LONG = ("MPPI", "stable_baselines3", "SoilFilter", "jacfwd", "prediction_errors")
+LONG = ("MPPI", "vw.train", "stable_baselines3", "SoilFilter", "jacfwd", "prediction_errors")
 """What stands in blocks that take more than a minute."""
 
 
