@@ -262,8 +262,10 @@ def validate(terrain: TerrainMap, name: str = "map") -> TerrainMap:
     resolution, origin = np.asarray(terrain.resolution), np.asarray(terrain.origin)
     if not (np.isfinite(resolution) and resolution > 0):
         raise MapError(name, "resolution", "metres between vertices, > 0", f"{resolution}")
-    if not np.isfinite(origin).all():
-        raise MapError(name, "origin", "finite x, y", f"{origin}")
+    # Farther away, float32 does not tell centimetres apart.
+    if not (np.abs(origin) < 1e5).all():
+        expected, mend = "finite x, y, less than 100 km", "count them from a point on the map"
+        raise MapError(name, "origin", expected, f"{origin}", mend)
     if not 0 <= int(terrain.world) < worlds:
         raise MapError(name, "world", f"0 to {worlds - 1}", f"{int(terrain.world)}")
 
