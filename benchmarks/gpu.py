@@ -40,10 +40,10 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import runs, training
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.suites import GroundConfig
+from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
 from vertiwm_jax.rl.loop import Seeds
-from vertiwm_jax.world_model.choice import ModelName
 
 Found = dict[str, Any]
 Case = tuple[str, Callable[[], Found]]

@@ -41,9 +41,10 @@ def main() -> None:
     dynamics, weights = experiment.dynamics(config, config.model)
     env = NavigationEnv(dynamics, config.navigation, config.variation)
     algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
-    training.compiled(algorithm, env.shapes(weights, terrain, pool), batch)
+    encoders = experiment.encoders(config)
+    training.compiled(algorithm, env.shapes(weights, terrain, pool, encoders), batch)
     results["compiled"] = {"most_MB": most()}
-    params = jax.block_until_ready(env.make_params(weights, terrain, pool))
+    params = jax.block_until_ready(env.make_params(weights, terrain, pool, encoders))
     results["worlds and starts"] = {
         "most_MB": most(),
         "terrain_MB": size(params.terrain),

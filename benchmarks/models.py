@@ -17,12 +17,13 @@ from vertiwm_jax.dynamics import Params, rollout
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.models.config import ModelConfig, with_soil
+from vertiwm_jax.models.registry import ModelName, load_model
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.worlds import WorldConfig
-from vertiwm_jax.world_model.choice import ModelName, choose, lean
-from vertiwm_jax.world_model.model import ModelConfig, VertiWM, VertiWMParams
+from vertiwm_jax.world_model.verti_wm import VertiWM, VertiWMParams
 
 BATCHES = (1, 20, 256, 1024)
 STEPS = 20
@@ -51,15 +52,15 @@ def drives(batch: int, steps: int) -> tuple[TerrainMap, VehicleState, Command]:
 
 def untrained() -> tuple[VertiWM, VertiWMParams]:
     """A Verti-WM of the paper's size with random weights, for none comes along."""
-    return PAPER.build(), PAPER.init_params(jax.random.key(0), chrono_like(hmmwv()))
+    params = PAPER.init_params(jax.random.key(0), chrono_like(hmmwv()))
+    return PAPER.verti_wm, with_soil(params, None)
 
 
 def driving(
     name: ModelName, weights: Path | None = None
 ) -> tuple[Callable[..., VehicleState], Params]:
     """Where one model drives, leaves `[T, 3]`, as a function; and its parameters."""
-    model, params = choose(name, weights)
-    model = lean(model)
+    model, params = load_model(name, weights)
 
     def drive(
         params: Params, terrain: TerrainMap, start: VehicleState, commands: Command

@@ -14,7 +14,7 @@ import jax
 
 from benchmarks._harness import Figures, parser, report
 from benchmarks.world_model_step import over_vehicles, parts
-from vertiwm_jax.world_model.model import Size
+from vertiwm_jax.models.config import Size
 
 _CALLS = 20
 _AROUND = ("while", "conditional", "call")  # what other operations are in

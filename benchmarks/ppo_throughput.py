@@ -16,17 +16,20 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from benchmarks._harness import Figures, measure, parser, report
-from benchmarks.models import PAPER, untrained
+from benchmarks.models import PAPER
 from vertiwm_jax import config as configuration
 from vertiwm_jax import parallel
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.mechanics.simulator import chrono_like
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.models import files
+from vertiwm_jax.models.config import Size
+from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
 from vertiwm_jax.rl.loop import Seeds
 from vertiwm_jax.rl.ppo import PPO
-from vertiwm_jax.world_model import model as world_model
-from vertiwm_jax.world_model.choice import ModelName, Operands
-from vertiwm_jax.world_model.model import Size
+from vertiwm_jax.world_model.network import ComputeDtype
 
 
 @struct.dataclass
@@ -67,7 +70,7 @@ def iteration(ppo: PPO, params: Any, repeat: int = 1) -> Figures:
     return results
 
 
-def of_task(name: str, model: ModelName, weights: Path | None, operands: Operands) -> Figures:
+def of_task(name: str, model: ModelName, weights: Path | None, operands: ComputeDtype) -> Figures:
     """An iteration of the training that the configuration `name` describes, inside a model."""
     file = configuration.default_config(name)
     config = configuration.load(PPOTraining, file)
@@ -82,7 +85,11 @@ def main() -> None:
     arguments.add_argument("--models", nargs="+", default=("builtin", "vertiwm"))
     arguments.add_argument("--size", choices=get_args(Size), default="base", help="of Verti-WM")
     arguments.add_argument(
-        "--operands", nargs="+", choices=get_args(Operands), default=("float32",), help="of models"
+        "--operands",
+        nargs="+",
+        choices=get_args(ComputeDtype),
+        default=("float32",),
+        help="of models",
     )
     chosen = arguments.parse_args()
     idle = environment.EnvParams(max_steps_in_episode=600)
@@ -91,7 +98,8 @@ def main() -> None:
         weights = None
         if chosen.size == "paper":
             weights = Path(folder)
-            world_model.save(weights, PAPER, untrained()[1])
+            params = PAPER.init_params(jax.random.key(0), chrono_like(hmmwv()))
+            files.save(weights, PAPER, params)
         for name in chosen.configs:
             for model in chosen.models:
                 for operands in chosen.operands:

@@ -17,17 +17,18 @@ from flax import struct
 from benchmarks._harness import parser, report
 from vertiwm_jax.evaluation import prediction
 from vertiwm_jax.evaluation.prediction import TestWindows
-from vertiwm_jax.learning import dataset, fitting, normalisation
+from vertiwm_jax.learning import calibration, dataset, fitting
 from vertiwm_jax.learning.fitting import FitConfig
 from vertiwm_jax.learning.losses import LossConfig
-from vertiwm_jax.learning.rollouts import OpenLoop, WindowConfig, WindowData, WindowProblem
+from vertiwm_jax.learning.objectives import RolloutLoss
+from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.runs import Run
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import motion
-from vertiwm_jax.world_model.normalisation import LOCAL, Normalisation
+from vertiwm_jax.world_model.normalization import INPUTS, Normalization
 
 UNITS = 256
 RELIEF = 0.5
@@ -50,10 +51,10 @@ class Network(nn.Module):
 
 @struct.dataclass
 class RecurrentParams:
-    """network: weights; normalisation: measured on drives."""
+    """network: weights; normalization: measured on drives."""
 
     network: Any
-    normalisation: Normalisation
+    normalization: Normalization
 
 
 @dataclass(frozen=True)
@@ -61,10 +62,10 @@ class Recurrent:
     """The `Dynamics`, whose history is the memory of the network."""
 
     def init_params(
-        self, key: jax.Array, constants: Normalisation, classes: int
+        self, key: jax.Array, constants: Normalization, classes: int
     ) -> RecurrentParams:
         """Untrained weights for maps of that many classes."""
-        features = jnp.zeros(LOCAL.size + 2 + len(GRID) + 4 * classes)
+        features = jnp.zeros(INPUTS + len(GRID) + 4 * classes)
         return RecurrentParams(Network().init(key, jnp.zeros(UNITS), features), constants)
 
     def init(self, params: RecurrentParams, terrain: TerrainMap, state: VehicleState) -> jax.Array:
@@ -78,15 +79,14 @@ class Recurrent:
         state: VehicleState,
         command: Command,
     ) -> tuple[VehicleState, jax.Array]:
-        constants, yaw = params.normalisation, state.rpy[2]
+        constants, yaw = params.normalization, state.rpy[2]
         cos, sin = jnp.cos(yaw), jnp.sin(yaw)
         to_world = jnp.array([[cos, sin], [-sin, cos]])
         here = state.position[:2]
         around = query.height(terrain, here + GRID @ to_world) - state.position[2]
         wheels = query.surface(terrain, here + hmmwv().wheel_position @ to_world)
         features = [
-            constants.state(state.vector),
-            constants.command(command.vector),
+            constants.inputs(state, command),
             around / RELIEF,
             jax.nn.one_hot(wheels.semantic, len(terrain.deformable)).ravel(),
         ]
@@ -103,9 +103,9 @@ def fitted(folders: list[Path], updates: int, runs: Path) -> tuple[Recurrent, Re
     config = FitConfig(updates=updates, weight_decay=0.05, trainable=("network",))
     windows = WindowConfig(context=8, weights=(1.0, 1.0, 2.0))
     model = Recurrent()
-    constants = normalisation.measure(training[0])
+    constants = calibration.normalization(training[0])
     params = model.init_params(jax.random.key(0), constants, len(training[1].deformable))
-    problem = WindowProblem(model, OpenLoop(model, LossConfig(velocity=0.05)), windows)
+    problem = WindowProblem(model, RolloutLoss(model, LossConfig(velocity=0.05)), windows)
     data = WindowData.of(windows, training, validation)
     with Run.create(runs, "recurrent", config) as run:
         return model, fitting.fit(problem, config, params, data, jax.random.key(1), run)

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from benchmarks._harness import Figures, measure, parser, report
 from benchmarks.models import drives
 from vertiwm_jax.dynamics import Params, rollout
+from vertiwm_jax.models.registry import ModelName, load_model
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.choice import ModelName, choose
 
 BATCHES = (1, 64)
 STEPS = 16
@@ -16,7 +16,7 @@ STEPS = 16
 
 def rates(name: ModelName, batches: tuple[int, ...]) -> dict[str, Figures]:
     """Seconds of a rollout, and of a rollout with its gradient, by batch."""
-    model, params = choose(name)
+    model, params = load_model(name)
 
     def travelled(
         params: Params, commands: Command, terrain: TerrainMap, starts: VehicleState

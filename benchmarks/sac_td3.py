@@ -9,8 +9,8 @@ from dataclasses import replace
 from benchmarks._harness import Figures, parser, report
 from benchmarks.ppo_throughput import iteration
 from vertiwm_jax import config as configuration
+from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
-from vertiwm_jax.world_model.choice import ModelName
 
 
 def of_task(name: str, model: ModelName) -> Figures:

@@ -56,9 +56,10 @@ def phases(name: str) -> dict[str, dict[str, float]]:
     dynamics, weights = experiment.dynamics(config, config.model)
     env = NavigationEnv(dynamics, config.navigation, config.variation)
     algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
-    training.compiled(algorithm, env.shapes(weights, terrain, pool), batch)
+    encoders = experiment.encoders(config)
+    training.compiled(algorithm, env.shapes(weights, terrain, pool, encoders), batch)
     lap("compile")
-    params = jax.block_until_ready(env.make_params(weights, terrain, pool))
+    params = jax.block_until_ready(env.make_params(weights, terrain, pool, encoders))
     machine.forget_programs()
     lap("starts")
     state = training.begin(algorithm, params, config.key("training"))

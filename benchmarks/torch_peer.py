@@ -16,12 +16,12 @@ from vertiwm_jax import machine, parallel
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.models.registry import load_model
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.worlds import WorldConfig
-from vertiwm_jax.world_model.choice import lean
-from vertiwm_jax.world_model.model import VertiWM, VertiWMParams
+from vertiwm_jax.world_model.verti_wm import VertiWM, VertiWMParams
 
 BATCHES = (20, 256)
 STEPS = 16
@@ -144,8 +144,9 @@ def agreement(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
 def rates(ways: Sequence[Way], batch: int, repeats: int) -> dict[str, Figures]:
     """Steps a second at one batch, once they are known to be the same steps."""
     drives = Drives.draw(batch, STEPS)
-    model, params = VertiWM.pretrained()
-    roll_ours = ours(lean(model), params)
+    model, params = load_model("vertiwm")
+    assert isinstance(model, VertiWM)
+    roll_ours = ours(model, params)
     rolls: dict[str, Roll] = {_OURS: roll_ours(drives)}
     for way in ways:
         peer = TorchVertiWM(model, params)

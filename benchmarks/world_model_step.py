@@ -8,7 +8,6 @@ in place and time and again, for new memory comes several times slower.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any, get_args
 
@@ -17,11 +16,12 @@ import jax.numpy as jnp
 
 from benchmarks._harness import Figures, measure, parser, report
 from benchmarks.models import drives, untrained
-from vertiwm_jax.world_model import fusion
-from vertiwm_jax.world_model.choice import Operands, lean
-from vertiwm_jax.world_model.fusion import Proposal
-from vertiwm_jax.world_model.model import Size, VertiWM
-from vertiwm_jax.world_model.perception import Glance
+from vertiwm_jax.models.config import Size
+from vertiwm_jax.models.registry import load_model
+from vertiwm_jax.perception.perceive import perceive
+from vertiwm_jax.world_model import fusion, motion
+from vertiwm_jax.world_model.network import ComputeDtype
+from vertiwm_jax.world_model.verti_wm import VertiWM
 
 Part = tuple[Callable[..., Any], tuple[Any, ...]]
 """A function of weights, of the map and of vehicles, over which it is vmapped, and what it gets."""
@@ -36,55 +36,60 @@ def over_vehicles(part: Part) -> Callable[..., Any]:
 
 def parts(batch: int, size: Size) -> dict[str, Part]:
     """Every part of a step on `batch` vehicles after their first step, and the whole."""
-    model, params = VertiWM.pretrained() if size == "base" else untrained()
-    model = lean(model)
-    transformer, nesam = model.transformer, model.nesam
+    model, params = load_model("vertiwm") if size == "base" else untrained()
+    assert isinstance(model, VertiWM)
     terrain, states, commands = drives(batch, 1)
     command = jax.tree.map(lambda x: x[:, 0], commands)
 
     start = jax.jit(jax.vmap(model.init, (None, None, 0)))
     begun = (params, terrain, start(params, terrain, states), states, command)
     state, history = over_vehicles((model.step, begun))(*begun)
+    vehicle, seen = params.vehicle, history.features
+
+    def look(encoders: Any, terrain: Any, state: Any) -> Any:
+        return perceive(encoders, terrain, state)
+
+    def by_transformer(weights: Any, terrain: Any, *given: Any) -> Any:
+        return model.transformer.propose(weights, vehicle, terrain, *given)
+
+    def by_nesam(weights: Any, terrain: Any, *given: Any) -> Any:
+        return model.nesam.propose(weights, vehicle, terrain, *given)
 
     def physics(simulator: Any, terrain: Any, memory: Any, state: Any, command: Any) -> Any:
-        return nesam.simulator.step(simulator, terrain, memory, state, command)
-
-    seen = Glance(history.perception.averaged)  # All that gates read, as much of either specialist.
+        return model.nesam.simulator.step(simulator, terrain, memory, state, command)
 
     def gate(
-        gates: Any, _: Any, seen: Any, hidden: Any, state: Any, command: Any, *proposed: Any
+        gates: Any, _: Any, averages: Any, hidden: Any, state: Any, command: Any, *proposed: Any
     ) -> Any:
-        proposals = [Proposal.of(state, of_one, seen) for of_one in proposed]
-        context = fusion.context(state, command, *proposals, model.gate_terrain)
-        alphas, hidden = model.weigh(gates, context, hidden)
-        return fusion.fuse(state, *proposals, alphas.mean(axis=0)), hidden
+        xi_t, xi_n = (motion.increment(state, each) for each in proposed)
+        nu_t, nu_n = map(motion.twist, proposed)
+        motions = state, command, xi_n, xi_t
+        context = fusion.context(model.gate_terrain, *averages, *motions)
+        outputs, hidden = fusion.run_gates(gates, context, hidden)
+        alphas = fusion.coefficients(outputs, model.coefficients)
+        beta = fusion.weights(alphas.mean(axis=0))
+        xi, nu = xi_t + beta * (xi_n - xi_t), nu_t + beta * (nu_n - nu_t)
+        return motion.moved(state, xi, nu), hidden
 
     driven = (state, command)
-    of_first = (params.transformer, terrain, history.transformer, *driven)
-    of_second = (params.nesam, terrain, history.nesam, *driven)
+    of_first = (params.transformer, terrain, seen[0], history.transformer, *driven)
+    of_second = (params.nesam, terrain, None, history.nesam, *driven)
     proposed = [
-        over_vehicles((one.propose, arguments))(*arguments)[0]
-        for one, arguments in ((transformer, of_first), (nesam, of_second))
+        over_vehicles((one, arguments))(*arguments)[0]
+        for one, arguments in ((by_transformer, of_first), (by_nesam, of_second))
     ]
-    # What is not read would count as bytes.
-    reduction = {"params": {"reduce": params.transformer.network["params"]["reduce"]}}
-    eyes = replace(
-        params,
-        transformer=replace(params.transformer, network=reduction),
-        nesam=replace(params.nesam, network=None, soil=None),
-        gate=None,
-    )
+    averages = seen[-1].average, seen[0].average
     return {
-        "map query and encoders": (model.look, (eyes, terrain, state)),
-        "Transformer": (transformer.propose, of_first),
+        "map query and encoders": (look, (params.encoders, terrain, state)),
+        "Transformer": (by_transformer, of_first),
         "NeSAM: physics": (
             physics,
-            (params.nesam.simulator, terrain, history.nesam.simulator, *driven),
+            (params.nesam.physics(vehicle), terrain, history.nesam.simulator, *driven),
         ),
-        "NeSAM: physics and network": (nesam.propose, of_second),
+        "NeSAM: physics and network": (by_nesam, of_second),
         "gate and fused motion": (
             gate,
-            (params.gate, terrain, seen, history.hidden, *driven, *proposed),
+            (params.gate, terrain, averages, history.hidden, *driven, *proposed),
         ),
         "the whole step": (model.step, (params, terrain, history, *driven)),
     }
@@ -94,7 +99,7 @@ def ceilings() -> dict[str, float]:
     """FLOP/s of matmuls and bytes/s of a sum of large arrays, on this machine, now."""
     ab = jax.random.normal(jax.random.key(0), (2, 1024, 1024))
     matmul = jax.jit(partial(jnp.matmul, preferred_element_type=jnp.float32))
-    single, half = (measure(matmul, *ab.astype(operands)) for operands in get_args(Operands))
+    single, half = (measure(matmul, *ab.astype(operands)) for operands in get_args(ComputeDtype))
     x, y = jnp.ones((2, 1 << 24))
     sums = jax.jit(lambda x, y: jax.lax.fori_loop(0, _SUMS, lambda _, x: x + y, x))
     moved = 3 * _SUMS * x.nbytes

@@ -9,9 +9,9 @@ from vertiwm_jax.cli.compare import CompareConfig
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
+from vertiwm_jax.models import files
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
-from vertiwm_jax.world_model import model
 
 FOLDER = Path(__file__).parents[1] / "configs"
 KINDS = {"table3": CompareConfig, "import_nedm": ImportSettings} | dict.fromkeys(
@@ -31,7 +31,7 @@ def test_every_one_can_be_read(file):
 def test_what_goes_on_from_the_model_that_comes_along_is_of_its_form(name):
     settings = config.load(FitConfig, FOLDER / f"{name}.yaml")
     assert settings.start == Path("pretrained")
-    assert settings.model == model.load(model.PRETRAINED)[0]
+    assert settings.model == files.load(files.PRETRAINED)[0]
 
 
 def test_the_papers_schedule_is_the_papers():

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from vertiwm_jax.mechanics.kinematic import place as place
     from vertiwm_jax.mechanics.vehicle import Vehicle as Vehicle
     from vertiwm_jax.mechanics.vehicle import load_vehicle as load_vehicle
+    from vertiwm_jax.models.registry import load_model as load_model
     from vertiwm_jax.rl.experiment import train as train
     from vertiwm_jax.rl.mppi import MPPI as MPPI
     from vertiwm_jax.rl.policy import Policy as Policy
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from vertiwm_jax.terrain.files import load_map as load_map
     from vertiwm_jax.terrain.map import TerrainMap as TerrainMap
     from vertiwm_jax.terrain.worlds import make_worlds as make_worlds
-    from vertiwm_jax.world_model.choice import load_model as load_model
 
 __version__ = "0.1.0"
 _PUBLIC = {
@@ -45,7 +45,7 @@ _PUBLIC = {
     "fit": "learning.experiment",
     "load_drives": "learning.dataset",
     "load_map": "terrain.files",
-    "load_model": "world_model.choice",
+    "load_model": "models.registry",
     "load_vehicle": "mechanics.vehicle",
     "make_env": "env.navigation",
     "make_worlds": "terrain.worlds",

@@ -77,10 +77,8 @@ def load(path: str | Path, like: State) -> State:
     leaves = _flatten(like)
     shapes = jax.eval_shape(hosts.without_keys, leaves)
     stored = {name: shapes[name] for name in leaves}  # in their order
-    this = jax.process_index()
-    alone = ocp.options.MultiprocessingOptions(primary_host=this, active_processes={this})
     try:
-        with _quiet(), ocp.Context(multiprocessing_options=alone):
+        with _quiet(), _alone():
             found = ocp.metadata(str(path)).metadata
             _check(path, stored, found)
             arrays = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in stored.items()}
@@ -90,6 +88,22 @@ def load(path: str | Path, like: State) -> State:
         raise CheckpointError(f"{path}: not a readable checkpoint: {reason}") from error
     restored = hosts.with_keys(leaves, restored)
     return jax.tree.unflatten(jax.tree.structure(like), [restored[name] for name in leaves])
+
+
+def names(path: str | Path) -> set[str]:
+    """Of the leaves in a checkpoint, dotted; none where it cannot be read."""
+    try:
+        with _quiet(), _alone():
+            return set(ocp.metadata(str(Path(path).absolute())).metadata)
+    except (OSError, ValueError, KeyError):
+        return set()
+
+
+def _alone() -> ocp.Context:
+    """In which this host reads by itself."""
+    this = jax.process_index()
+    options = ocp.options.MultiprocessingOptions(primary_host=this, active_processes={this})
+    return ocp.Context(multiprocessing_options=options)
 
 
 def _flatten(state: Any) -> dict[str, Any]:

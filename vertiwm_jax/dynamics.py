@@ -5,8 +5,10 @@ frozen, hashable object with two pure functions of one vehicle. Batches are made
 trajectories by `lax.scan`; weights, maps and state are arguments.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +18,7 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 Params = Any
 History = Any
-EMBEDDING_SHAPE = (16, 16, 36)
-"""Rows, the first farthest ahead; columns, the first farthest left; and features."""
+T = TypeVar("T")
 
 
 class Dynamics(Protocol):
@@ -26,7 +27,7 @@ class Dynamics(Protocol):
     `init` starts the history of a vehicle that stands or drives at `state`; `step` holds
     `command` for one step and gives the next state with the history that goes with it. What a
     model perceives of the ground at a state is part of the history it returns with that state,
-    so a policy can read it without computing it again.
+    as its field `features`: what the model's `see(params, terrain, state)` gives, if it has that.
     """
 
     def init(self, params: Params, terrain: TerrainMap, state: VehicleState) -> History: ...
@@ -63,18 +64,13 @@ def spread(history: History) -> jax.Array:
     return getattr(history, "spread", jnp.float32(0))
 
 
-def embedding(history: History) -> jax.Array:
-    """`EMBEDDING_SHAPE` of the ground, as the model sees it at the state that `history` goes with.
+def embedding(history: History) -> jax.Array | None:
+    """`[16, 16, 36]` latents of the ground, as the model sees it at the state of `history`.
 
-    `ValueError` for a model that sees none.
+    None of a model that does not keep them.
     """
-    latent = getattr(getattr(history, "perception", None), "latent", None)
-    if latent is None:
-        raise ValueError(
-            "embeddings: expected a model that sees patches of the ground and remembers them, "
-            "found one that does not; world_model.perception.Sighted gives it encoders"
-        )
-    return latent
+    features = getattr(history, "features", ())
+    return features[0].latents if features else None
 
 
 def warm_up(
@@ -98,6 +94,37 @@ def warm_up(
 
     history, _ = jax.lax.scan(advance, dynamics.init(params, terrain, first), (before, commands))
     return history
+
+
+def along(
+    dynamics: Dynamics,
+    params: Params,
+    terrain: TerrainMap,
+    states: VehicleState,
+    commands: Command,
+    read: Callable[[History], T] = lambda _: None,
+) -> tuple[VehicleState, T]:
+    """A step from each of T recorded states, leaves `[T, 3]`, with the history of those before it.
+
+    A model looks at the ground where the drive was. commands: `[T]`.
+
+    Returns:
+        Where each step leads, leaves `[T, 3]`, and what is read of the histories after them.
+    """
+
+    see = getattr(dynamics, "see", None)
+
+    def seeing(history: History, features: Any) -> History:
+        return replace(history, features=features) if see else history
+
+    def advance(history: History, inputs: tuple[VehicleState, Command]) -> tuple[History, Any]:
+        state, command = inputs
+        history = seeing(history, see(params, terrain, state) if see else None)
+        proposed, history = dynamics.step(params, terrain, history, state, command)
+        return seeing(history, None), (proposed, read(history))
+
+    first = dynamics.init(params, terrain, jax.tree.map(lambda x: x[0], states))
+    return jax.lax.scan(advance, seeing(first, None), (states, commands))[1]
 
 
 def rollout(

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from benchmarks.peers.torch_query import tensor
 from vertiwm_jax.terrain.patches import CELL_PIXELS
-from vertiwm_jax.world_model.sizes import TransformerSize
-from vertiwm_jax.world_model.specialist_network import WINDOW
+from vertiwm_jax.world_model.network import WINDOW, NetworkSize
 
 Weights = Mapping[str, Any]
 """What flax calls the parameters of a module."""
@@ -93,12 +92,12 @@ class SpecialistNetwork(nn.Module):
     cos: Tensor
     sin: Tensor
 
-    def __init__(self, weights: Weights, size: TransformerSize):
+    def __init__(self, weights: Weights, size: NetworkSize, reduce: Weights | None = None):
         super().__init__()
         self.size, blocks = size, weights["transformer"]
         self.embed = _linear(weights["embed"])
-        if "reduce" in weights:
-            self.reduce = _linear(weights["reduce"])
+        if reduce is not None:
+            self.reduce = _linear(reduce)
             self.embed_ground = _linear(weights["embed_ground"])
         self.blocks = nn.ModuleList(
             Block(blocks[f"blocks_{i}"], size.heads) for i in range(size.layers)

@@ -16,11 +16,12 @@ from benchmarks.peers.torch_networks import Cache, Encoder, Gate, SpecialistNetw
 from benchmarks.peers.torch_query import Ground, patches, tensor
 from benchmarks.peers.torch_touch import WHEELS
 from vertiwm_jax.mechanics.vehicle import GRAVITY
+from vertiwm_jax.models.config import ModelConfig
 from vertiwm_jax.networks.gate import HIDDEN
-from vertiwm_jax.world_model import step_features
-from vertiwm_jax.world_model.model import ModelConfig, VertiWM, VertiWMParams
-from vertiwm_jax.world_model.normalisation import LOCAL
-from vertiwm_jax.world_model.step_features import DEPTH, FIRM, LARGEST, TRAVEL, StepFeatures
+from vertiwm_jax.world_model import nesam_inputs
+from vertiwm_jax.world_model.nesam_inputs import DEPTH, FIRM, LARGEST, TRAVEL, StepFeatures
+from vertiwm_jax.world_model.normalization import LOCAL
+from vertiwm_jax.world_model.verti_wm import VertiWM, VertiWMParams
 
 _SHIPPED = ModelConfig(encoders="shared")
 _WHEEL_FEATURES = 14
@@ -51,13 +52,14 @@ class TorchVertiWM(nn.Module):
     def __init__(self, model: VertiWM, params: VertiWMParams):
         """Raises `ValueError` for a model of another form than the one that ships."""
         super().__init__()
-        if model != _SHIPPED.build():
-            raise ValueError(f"model: expected {_SHIPPED.build()}, found {model}")
-        transformer, nesam = params.transformer, params.nesam
+        if model != _SHIPPED.verti_wm:
+            raise ValueError(f"model: expected {_SHIPPED.verti_wm}, found {model}")
+        transformer, nesam, (encoders,) = params.transformer, params.nesam, params.encoders
+        assert transformer and nesam and params.gate
         size = _SHIPPED.transformer.size
-        self.elevation = Encoder(transformer.encoders.elevation["params"])
-        self.semantic = Encoder(transformer.encoders.semantic["params"])
-        self.transformer = SpecialistNetwork(transformer.network["params"], size)
+        self.elevation = Encoder(encoders.elevation["params"])
+        self.semantic = Encoder(encoders.semantic["params"])
+        self.transformer = SpecialistNetwork(transformer.network["params"], size, encoders.reduce)
         self.nesam = SpecialistNetwork(nesam.network["params"], size)
         gates = params.gate.network["params"]
         self.gates = nn.ModuleList(
@@ -65,19 +67,19 @@ class TorchVertiWM(nn.Module):
             for number in range(len(params.gate))
         )
         self.gate_mean, self.gate_scale = tensor(params.gate.mean), tensor(params.gate.scale)
-        self.normalisation = constants(transformer.normalisation)
-        self.deviations = constants(nesam.normalisation)
+        self.normalization = constants(transformer.normalization)
+        self.deviations = constants(nesam.normalization)
         self.correction_scale = tensor(nesam.correction_scale)
-        self.vehicle = constants(nesam.simulator.vehicle)
-        self.vehicle.wheelbase = float(nesam.simulator.vehicle.wheelbase)
+        self.vehicle = constants(params.vehicle)
+        self.vehicle.wheelbase = float(params.vehicle.wheelbase)
         self.simulator = Simulator(
             self.vehicle,
-            constants(nesam.simulator.contact),
-            float(nesam.simulator.stiffening),
+            constants(nesam.contact),
+            float(nesam.stiffening),
             _SHIPPED.nesam.simulator.substeps,
         )
         self.mirror_signs, self.mirror_places = _mirror()
-        self.motion_signs = tensor(step_features.MOTION_SIGNS)
+        self.motion_signs = tensor(nesam_inputs.MOTION_SIGNS)
 
     def init(self, ground: Ground, state: Tensor) -> History:
         """Histories of vehicles at `[B, 12]`, and a look at the ground."""
@@ -138,7 +140,7 @@ class TorchVertiWM(nn.Module):
         self, history: History, state: Tensor, command: Tensor
     ) -> tuple[Tensor, Cache]:
         """The next state `[B, 12]` as the Transformer has it."""
-        scale = self.normalisation
+        scale = self.normalization
         features = torch.cat(
             [
                 (state[:, _LOCAL] - scale.state_mean) / scale.state_deviation,
@@ -217,8 +219,8 @@ def constants(struct: Any) -> Any:
 
 def _mirror() -> tuple[Tensor, Tensor]:
     """Signs and places `[91]` of what a mirror makes of features, found by mirroring places."""
-    places = jnp.arange(1, step_features.SIZE + 1)
-    body, wheels = jnp.split(places, [step_features.SIZE - WHEELS * _WHEEL_FEATURES])
+    places = jnp.arange(1, nesam_inputs.SIZE + 1)
+    body, wheels = jnp.split(places, [nesam_inputs.SIZE - WHEELS * _WHEEL_FEATURES])
     seen = StepFeatures(body, wheels.reshape(WHEELS, -1)).mirrored
     mirrored = np.concatenate([seen.body, np.ravel(seen.wheels)])
     return tensor(np.sign(mirrored).astype(np.float32)), tensor(np.abs(mirrored) - 1).long()

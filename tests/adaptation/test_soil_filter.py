@@ -12,13 +12,12 @@ from vertiwm_jax.evaluation.adaptation import behaviour, mistaken
 from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.models.registry import load_model
 from vertiwm_jax.networks import soil_predictor
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.soil import PRESETS
-from vertiwm_jax.world_model.model import ModelConfig, VertiWM
-from vertiwm_jax.world_model.nesam import Nesam
 
 GRASS, MUD, SAND = 3, 7, 8
 EFFECT = 0.1 * np.random.default_rng(0).normal(size=(6, 6))
@@ -148,13 +147,13 @@ def test_at_first_the_map_is_believed():
 
 
 def test_physics_is_differentiated_exactly_and_has_to_read_the_map():
-    assert soil_filter._differentiable(Nesam()) == Nesam(gradient="exact")
-    assert soil_filter._differentiable(Simulator()) == Simulator()
-    fused = soil_filter._differentiable(ModelConfig().build())
-    assert isinstance(fused, VertiWM) and fused.nesam == soil_filter._differentiable(Nesam())
-    for config in (Nesam(soil="predicted"), ModelConfig(soil="predicted").build()):
+    soil_filter._check(Simulator(), chrono_like(hmmwv()))
+    for name in ("nesam", "vertiwm"):
+        soil_filter._check(*load_model(name, exact_gradient=True))
+        with pytest.raises(ValueError, match=r"model: expected one of load_model.exact_gradient"):
+            soil_filter._check(*load_model(name))
         with pytest.raises(ValueError, match=r"soil: expected 'map' .*, found 'predicted'"):
-            soil_filter._differentiable(config)
+            soil_filter._check(*load_model(name, soil="predicted", exact_gradient=True))
 
 
 @pytest.mark.parametrize(

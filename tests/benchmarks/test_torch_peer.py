@@ -11,9 +11,9 @@ torch = pytest.importorskip("torch", reason="needs the extra `peers`")
 from benchmarks import torch_peer  # noqa: E402
 from benchmarks.peers import torch_query  # noqa: E402
 from benchmarks.peers.torch_vertiwm import TorchVertiWM  # noqa: E402
+from vertiwm_jax.models.registry import load_model  # noqa: E402
 from vertiwm_jax.terrain import patches  # noqa: E402
 from vertiwm_jax.terrain.worlds import WorldConfig, labels  # noqa: E402
-from vertiwm_jax.world_model.model import VertiWM  # noqa: E402
 
 VEHICLES = 2 * torch_peer.WORLDS
 STEPS = 4
@@ -27,7 +27,7 @@ def drives():
 @pytest.fixture(scope="module")
 def states(drives):
     """`[B, T, 12]` of ours and of PyTorch's."""
-    model, params = VertiWM.pretrained()
+    model, params = load_model("vertiwm")
     ours = torch_peer.ours(model, params)(drives)()
     theirs = torch_peer.theirs(TorchVertiWM(model, params), drives)()
     return np.asarray(ours), np.asarray(theirs)
@@ -89,6 +89,6 @@ def test_states_that_are_no_numbers_are_not_timed(states):
 
 
 def test_a_model_of_another_form_is_refused():
-    model, params = VertiWM.pretrained()
+    model, params = load_model("vertiwm")
     with pytest.raises(ValueError, match="model: expected VertiWM"):
         TorchVertiWM(replace(model, gate_terrain="both"), params)

@@ -18,11 +18,11 @@ from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment as task_of_learning
 from vertiwm_jax.rl.experiment import TaskConfig
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.world_model.choice import ModelName
 
 KEY = jax.random.key(0)
 AHEAD = jnp.array([1.0, 0.0])

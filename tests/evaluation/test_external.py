@@ -15,10 +15,10 @@ from vertiwm_jax.env.termination import TerminationReason as Reason
 from vertiwm_jax.evaluation import external
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.models.registry import load_encoders
 from vertiwm_jax.simulators import processes
 from vertiwm_jax.simulators.builtin import BuiltIn
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.world_model.choice import sighted
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -34,9 +34,8 @@ def test_the_built_in_simulator_outside_jit_is_that_inside(jobs):
         goal=jnp.array([[0.0, 0.0], [30.0, -30.0], [-50.0, 0.0]]),
     )
     config = NavigationConfig(speed_range=(0.0, 5.0), horizon_seconds=6.0, embeddings=True)
-    moves = sighted("builtin", Simulator(), chrono_like(hmmwv()))
-    env = NavigationEnv(moves[0], config)
-    params = env.make_params(moves[1], terrain, tasks)
+    env = NavigationEnv(Simulator(), config)
+    params = env.make_params(chrono_like(hmmwv()), terrain, tasks, load_encoders())
     arguments = env, params, jax.tree_util.Partial(led_by_embedding), jax.random.key(0)
     inside = run_episodes(*arguments)
     with processes.simulating(jobs) as mapped:

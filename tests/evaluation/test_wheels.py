@@ -12,9 +12,10 @@ from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.dataset import Auxiliary
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity
+from vertiwm_jax.models.config import ModelConfig, with_soil
+from vertiwm_jax.models.registry import load_model
 from vertiwm_jax.state import VehicleState
-from vertiwm_jax.world_model.choice import choose
-from vertiwm_jax.world_model.model import ModelConfig
+from vertiwm_jax.world_model.alone import Alone
 
 OPEN = Path(__file__).parents[2] / "data" / "open"
 
@@ -38,7 +39,7 @@ def compared(test, model, params):
 
 @pytest.fixture(scope="module")
 def simulated(test):
-    return compared(test, *choose("builtin"))
+    return compared(test, *load_model("builtin"))
 
 
 def test_wheels_of_the_simulator_go_with_those_recorded(test, simulated):
@@ -57,17 +58,17 @@ def test_wheels_of_the_simulator_go_with_those_recorded(test, simulated):
 
 def test_every_model_with_physics_tells_of_its_wheels_and_others_do_not(test, simulated):
     config = ModelConfig()
-    params = config.init_params(jax.random.key(0), choose("builtin")[1])
+    params = with_soil(config.init_params(jax.random.key(0), load_model("builtin")[1]), None)
     # Untrained, NeSAM is physics as it is.
-    found = compared(test, config.nesam, params.nesam)
+    found = compared(test, Alone(config.nesam), params)
     assert len(found) == 3
     np.testing.assert_allclose([x.error for x in found], [x.error for x in simulated], rtol=1e-3)
     terrain = test.terrain.select(0)
     state = VehicleState.from_vector(test.windows.state[0, 0])
-    fused = prediction.modelled(config.build().init(params, terrain, state))
+    fused = prediction.modelled(config.verti_wm.init(params, terrain, state))
     assert fused is not None
     chex.assert_trees_all_equal(
-        fused, prediction.modelled(config.nesam.init(params.nesam, terrain, state))
+        fused, prediction.modelled(Alone(config.nesam).init(params, terrain, state))
     )
     assert compared(test, ConstantVelocity(), None) == []
 
@@ -75,6 +76,6 @@ def test_every_model_with_physics_tells_of_its_wheels_and_others_do_not(test, si
 def test_what_was_not_recorded_is_not_compared(test, simulated):
     speed = test.windows.auxiliary.wheel_omega
     some = replace(test, windows=test.windows.replace(auxiliary=Auxiliary(wheel_omega=speed)))
-    assert compared(some, *choose("builtin")) == [simulated[1]]
+    assert compared(some, *load_model("builtin")) == [simulated[1]]
     none = replace(test, windows=test.windows.replace(auxiliary=Auxiliary()))
-    assert compared(none, *choose("builtin")) == []
+    assert compared(none, *load_model("builtin")) == []

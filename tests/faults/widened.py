@@ -22,6 +22,7 @@ from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of, rest_on_ground
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.models.registry import load_model
 from vertiwm_jax.rl.off_policy import OffPolicy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
@@ -29,7 +30,6 @@ from vertiwm_jax.rl.td3 import TD3, TD3Config
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import worlds
-from vertiwm_jax.world_model.model import VertiWM
 
 COLLECTED = {"transitions": 64, "num_envs": 8, "num_steps": 8, "hidden": (8,)}
 REPLAYED = COLLECTED | {"updates": 1, "batch": 8, "capacity": 64, "warm_up": 64}
@@ -68,7 +68,7 @@ CASES = {
     "worlds": lambda: worlds.generate(jax.random.split(jax.random.key(0), 1), worlds.WorldConfig()),
     "bicycle": lambda: drive(KinematicBicycle(), bicycle_of(hmmwv())),
     "simulator": lambda: drive(Simulator(), chrono_like(hmmwv())),
-    "shipped weights": lambda: drive(*VertiWM.pretrained()),
+    "shipped weights": lambda: drive(*load_model("vertiwm")),
     "gymnax": lambda: gymnax.make(vertiwm_jax.env.gymnax.NAME, model="builtin", number=1, starts=4)[
         1
     ],

@@ -23,7 +23,6 @@ from rl.probes import ProbeParams, Target
 
 from vertiwm_jax import cli, runs
 from vertiwm_jax import config as configuration
-from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
@@ -32,7 +31,11 @@ from vertiwm_jax.learning import pipeline, stages
 from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.learning.fitting import Fit, FitInputs, Problem, merge
 from vertiwm_jax.learning.stages import Inputs
-from vertiwm_jax.networks.soil_predictor import BOUNDS, SoilPredictor
+from vertiwm_jax.models import files
+from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
+from vertiwm_jax.networks.soil_predictor import BOUNDS
+from vertiwm_jax.perception.features import EMBEDDING_SHAPE
+from vertiwm_jax.perception.perceive import perceive
 from vertiwm_jax.rl.off_policy import OffPolicy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
@@ -42,8 +45,7 @@ from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model import model
-from vertiwm_jax.world_model.choice import Imagined, Operands, choose, eyes, rounded, sighted
+from vertiwm_jax.world_model.network import ComputeDtype
 
 Numbers = dict[str, Any]
 
@@ -115,9 +117,9 @@ def commands() -> Command:
     return Command(jnp.asarray(speed, jnp.float32), jnp.asarray(steering, jnp.float32))
 
 
-def rollout(name: Imagined, operands: Operands = "float32") -> Numbers:
+def rollout(name: Imagined, dtype: ComputeDtype = "float32") -> Numbers:
     """Where all vehicles go, and what the model remembers."""
-    dynamics, params = choose(name)
+    dynamics, params = load_model(name, compute_dtype=dtype)
 
     @jax.jit
     def drive(params: Any, terrain: TerrainMap, start: VehicleState, commands: Command) -> Numbers:
@@ -129,7 +131,7 @@ def rollout(name: Imagined, operands: Operands = "float32") -> Numbers:
         return jax.lax.scan(advance, (start, history), commands)[1]
 
     of_all = jax.vmap(drive, (None, None, 0, 0))
-    found = of_all(rounded(params, operands), ground(), starts(), commands())
+    found = of_all(params, ground(), starts(), commands())
     return {quantity: x[:, KEPT] for quantity, x in found.items()}
 
 
@@ -141,6 +143,8 @@ def _remembered(name: Imagined, history: Any) -> Numbers:
         gates = "coefficients", "disagreement", "spread"
         found |= {"hidden": hidden, **{gate: getattr(history, gate) for gate in gates}}
         history = history.nesam
+    if name == "nesam":
+        history = history.specialist
     if name in ("vertiwm", "nesam"):
         history = history.simulator
     if name in ("vertiwm", "nesam", "builtin"):
@@ -150,10 +154,10 @@ def _remembered(name: Imagined, history: Any) -> Numbers:
 
 def sight() -> Numbers:
     """What encoders see at the starts, and which soil NeSAM takes it for."""
-    terrain, look = ground(), eyes()
-    seen = jax.jit(jax.vmap(lambda state: look(terrain, state)))(starts())
-    soil = SoilPredictor().apply(choose("nesam")[1].soil, seen.semantic, jnp.float32(0))
-    latent = seen.latent
+    terrain, weights = ground(), files.load(files.PRETRAINED)[1].encoders[0].soil
+    encoders = (replace(load_encoders(), soil=weights),)
+    (seen,) = jax.jit(jax.vmap(lambda state: perceive(encoders, terrain, state, True)))(starts())
+    soil, latent = seen.soil, seen.latents
     return {
         "mean": latent.mean(axis=(1, 2)),
         "deviation": latent.std(axis=(1, 2)),
@@ -164,11 +168,11 @@ def sight() -> Numbers:
 
 def environment() -> Numbers:
     """Five steps of four tasks as policies see them, the ground by encoders too."""
-    dynamics, weights = sighted("bicycle", *choose("bicycle"))
+    dynamics, weights = load_model("bicycle")
     env = NavigationEnv(dynamics, NavigationConfig(embeddings=True))
     xy, yaw = (jnp.asarray(STARTS[::2, columns], jnp.float32) for columns in ([0, 1], 5))
     pool = Tasks(jnp.zeros(len(xy), jnp.int32), xy, yaw, goal=-xy)
-    params = env.make_params(weights, ground(), pool)
+    params = env.make_params(weights, ground(), pool, load_encoders())
     states, rewards = params.starts, []
     step = jax.jit(jax.vmap(env.step_env, (None, 0, 0, None)))
     actions = jnp.array([[1.0, -0.5], [0.5, 0.2], [0.0, 0.0], [-0.5, 1.0]])
@@ -228,7 +232,7 @@ def fit(name: str, **changes: Any) -> Numbers:
         windows=replace(config.windows, batch=4, context=2, horizon=4),
         patches=replace(config.patches, batch=4),
     )
-    start = model.load(model.PRETRAINED)[1] if config.start else None
+    start = files.load(files.PRETRAINED)[1] if config.start else None
     with tempfile.TemporaryDirectory() as folder, patch.object(stages, "fit", stage):
         for kind in pipeline.KINDS:
             for file in (Path(kind, f"{kind}_001.npz"), Path("maps", f"{kind}_001.npz")):
@@ -237,7 +241,7 @@ def fit(name: str, **changes: Any) -> Numbers:
         run, key = Run(Path(folder), None), jax.random.key(0)
         params = pipeline.fit(config, [Path(folder)], key, run, start=start)
     if start is None and "gate" in config.model.parts:
-        constants = vars(params.nesam.normalisation) | {
+        constants = vars(params.nesam.normalization) | {
             "correction_scale": params.nesam.correction_scale,
             "response": params.nesam.response,
             "gate_mean": params.gate.mean,

@@ -11,20 +11,20 @@ from doors import door, refusal
 
 from vertiwm_jax import runs
 from vertiwm_jax.cli import collect
-from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env.observation import LAYOUT, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.learning.dataset import Auxiliary
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.models.registry import load_encoders
+from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.simulators import chrono, collection, excitation
 from vertiwm_jax.simulators.driving import Drive
 from vertiwm_jax.simulators.protocol import Observation, SimulatorError
 from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.reveal import RevealConfig
-from vertiwm_jax.world_model import choice
 
 GRASS, SAND = 3, 8
 STEPS = 6
@@ -240,14 +240,14 @@ class Ahead:
         return np.broadcast_to([30.0, 0.0], shape)
 
 
-@pytest.mark.parametrize("eyes", [None, choice.eyes()], ids=["arcs", "embeddings"])
-def test_a_policy_drives_from_goal_to_goal(maps, eyes):
+@pytest.mark.parametrize("encoders", [None, load_encoders()], ids=["arcs", "embeddings"])
+def test_a_policy_drives_from_goal_to_goal(maps, encoders):
     terrain = files.load_map(maps / "map_0.npz")
-    config = NavigationConfig(speed_range=(0.0, 5.0), embeddings=eyes is not None)
-    size = OBSERVATION_SIZE + (math.prod(EMBEDDING_SHAPE) if eyes else 0)
+    config = NavigationConfig(speed_range=(0.0, 5.0), embeddings=encoders is not None)
+    size = OBSERVATION_SIZE + (math.prod(EMBEDDING_SHAPE) if encoders else 0)
     policy = jax.tree_util.Partial(AtGoal(size))
     rng = np.random.default_rng(0)
-    pilot = collection.to_goals(policy, config, eyes, hmmwv(), terrain, (0.0, 0.0, 0.0), rng)
+    pilot = collection.to_goals(policy, config, encoders, hmmwv(), terrain, (0.0, 0.0, 0.0), rng)
     height = float(query.height(terrain, jnp.zeros(2)))
     state, goals = np.array([0, 0, height, *np.zeros(9)], np.float32), []
     for _ in range(3):
@@ -262,7 +262,7 @@ def test_a_policy_drives_from_goal_to_goal(maps, eyes):
     assert np.linalg.norm(np.diff(goals, axis=0), axis=-1).min() >= 20
     command = collect.Collect(output=maps, seconds=2.0)
     alone = jax.device_get(terrain.subset(np.array([0])))
-    task = collect.Task(command, hmmwv(), (policy, config, eyes), alone, 0, drive=1)
+    task = collect.Task(command, hmmwv(), (policy, config, encoders), alone, 0, drive=1)
     drive = collect.record(task)
     assert drive.control.shape == (20, 2) and np.all(drive.control[:, 0] == 2.5)
 

@@ -17,7 +17,8 @@ from vertiwm_jax import machine, parallel
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.dataset import Auxiliary
 from vertiwm_jax.learning.fitting import Fit, FitConfig, FitInputs
-from vertiwm_jax.learning.rollouts import OpenLoop, WindowConfig, WindowData, WindowProblem
+from vertiwm_jax.learning.objectives import RolloutLoss
+from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.rl.loop import Seeds
@@ -199,7 +200,7 @@ def test_fitting_on_two_devices_is_fitting_on_one(two):
     drives = jax.tree.map(lambda x: x[:1], replace(drives, auxiliary=Auxiliary()))
     model, params = KinematicBicycle(), bicycle_of(hmmwv())
     data = WindowData.of(config, (drives, terrain), (drives, terrain))
-    problem = WindowProblem(model, OpenLoop(model), config)
+    problem = WindowProblem(model, RolloutLoss(model), config)
     fit = Fit(problem, FitConfig(updates=4, updates_per_iteration=4, warm_up=1))
     assert problem.batch == 16
     inputs = FitInputs(jax.tree.map(jnp.asarray, params), data)

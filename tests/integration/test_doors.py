@@ -18,9 +18,12 @@ from vertiwm_jax import checkpoints, machine, runs
 from vertiwm_jax import config as configuration
 from vertiwm_jax.cli import evaluate
 from vertiwm_jax.deploy import run_policy
-from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.models import files as model_files
+from vertiwm_jax.models.config import ModelConfig
+from vertiwm_jax.models.registry import load_model
+from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
 from vertiwm_jax.rl.planning import PlanningConfig
@@ -28,9 +31,6 @@ from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.reveal import RevealConfig
-from vertiwm_jax.world_model import model
-from vertiwm_jax.world_model.choice import choose
-from vertiwm_jax.world_model.model import ModelConfig
 
 GRASS = 3
 TINY = """
@@ -306,8 +306,8 @@ def test_training_inside_a_world_model_and_judged_in_the_simulator(
 ):
     monkeypatch.setattr(machine, "multiplies_bfloat16", lambda: True)
     config = ModelConfig()
-    params = config.init_params(jax.random.key(0), choose("builtin")[1])
-    model.save(tmp_path / "model", config, params)
+    params = config.init_params(jax.random.key(0), load_model("builtin")[1])
+    model_files.save(tmp_path / "model", config, params)
     varied = ["--variation.grip", "0.6", "1.0", "--variation.delay", "0", "2"]
     run = train("--model", "vertiwm", "--weights", str(tmp_path / "model"), *varied)
     expected = "training in vertiwm on 2 worlds, multiplying bfloat16"

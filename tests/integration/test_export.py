@@ -17,21 +17,22 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
 from vertiwm_jax.cli import export
 from vertiwm_jax.deploy import onnx_graph, run_policy, stablehlo
-from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.controllers import LookAhead, StraightToGoal
 from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.models.registry import load_encoders
 from vertiwm_jax.networks.policy import Actor, Senses, SquashedActor
+from vertiwm_jax.perception.features import EMBEDDING_SHAPE
+from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.rl.experiment import SACTraining
 from vertiwm_jax.rl.learned import Corrected, MeanAction
 from vertiwm_jax.rl.normalise import RunningStatistics
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.reveal import RevealConfig
-from vertiwm_jax.world_model import choice
 
 CONFIG = NavigationConfig(speed_range=(-1.0, 5.0))
 ACTORS = {
@@ -177,11 +178,11 @@ def test_the_observation_of_map_arrays(size, sighted):
     arrays = (terrain.elevation, terrain.semantic, terrain.friction, terrain.obstacles)
     state = VehicleState.from_vector(jnp.array([15, 1, 2, 0.1, -0.2, 0.7, 3, 0, 0, 0, 0, 0.1]))
     goal, action = jnp.array([20.0, 5.0, 1.0]), jnp.array([0.3, -0.4])
-    eyes, config = choice.eyes() if sighted else None, NavigationConfig()
+    encoders, config = load_encoders() if sighted else None, NavigationConfig()
     observe, find_way, find_none = (
         jax.export.deserialize(bytearray(data)).call
         for data in (
-            stablehlo.observe(config, hmmwv(), eyes),
+            stablehlo.observe(config, hmmwv(), encoders),
             stablehlo.route(config, hmmwv()),
             stablehlo.route(NavigationConfig(reveal=RevealConfig(range=12.0)), hmmwv()),
         )
@@ -198,10 +199,8 @@ def test_the_observation_of_map_arrays(size, sighted):
         terrain, hmmwv(), state, goal, routes, action
     )
     assert 0 < (observation.arcs_ahead(expected)[1] == 7.5).sum() < 72
-    if eyes:
-        expected = observation.with_embedding(
-            expected, jax.jit(lambda: eyes(terrain, state).latent)()
-        )
+    if encoders:
+        expected = observation.with_embedding(expected, jax.jit(embed)(encoders, terrain, state))
         assert float(jnp.std(expected[OBSERVATION_SIZE:])) > 0.1
     found = observe(*arrays, way, state.vector, goal, action)
     np.testing.assert_allclose(found, expected, atol=1e-5)

@@ -15,9 +15,11 @@ from vertiwm_jax import runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.learning import dataset
+from vertiwm_jax.models import files
+from vertiwm_jax.models.config import ModelConfig
+from vertiwm_jax.models.registry import load_model
 from vertiwm_jax.state import Command, VehicleState
-from vertiwm_jax.world_model import model
-from vertiwm_jax.world_model.choice import choose
+from vertiwm_jax.world_model.fusion import POSITION_AND_YAW
 
 RECORDED = Path(__file__).parents[1] / "data" / "chrono_drives"
 STAGES = (
@@ -78,7 +80,7 @@ def test_every_stage_leaves_its_metrics_and_all_together_a_model(run, folder):
     ground = terrain.select(jnp.int32(0))
     ends = {}
     for name in ("transformer", "nesam", "vertiwm", "builtin"):
-        dynamics, params = choose(name, run / "model")
+        dynamics, params = load_model(name, run / "model")
         history = dynamics.init(params, ground, state)
         states = rollout(dynamics, params, ground, state, commands, history)
         ends[name] = np.asarray(states.position[-1])
@@ -87,19 +89,21 @@ def test_every_stage_leaves_its_metrics_and_all_together_a_model(run, folder):
 
 
 def test_constants_are_measured_and_only_what_is_named_is_learned(run):
-    untrained = model.ModelConfig().init_params(jax.random.key(0), choose("builtin")[1])
-    params = model.load(run / "model")[1]
+    untrained = ModelConfig().init_params(jax.random.key(0), load_model("builtin")[1])
+    params = files.load(run / "model")[1]
     assert np.all(np.asarray(params.nesam.correction_scale) != 1)
     scale = np.asarray(params.gate.scale)
-    assert np.all(scale[list(model.POSITION_AND_YAW)] == 0) and (scale > 0).sum() > 50
-    chex.assert_trees_all_equal(params.nesam.simulator, untrained.nesam.simulator)
+    assert np.all(scale[list(POSITION_AND_YAW)] == 0) and (scale > 0).sum() > 50
+    physics = (params.vehicle, params.nesam.contact, params.nesam.stiffening)
+    expected = (untrained.vehicle, untrained.nesam.contact, untrained.nesam.stiffening)
+    chex.assert_trees_all_equal(physics, expected)
     for specialist in (params.transformer, params.nesam):
-        deviation = np.asarray(specialist.normalisation.transition_deviation)
+        deviation = np.asarray(specialist.normalization.transition_deviation)
         assert np.all(deviation != 1)
 
 
 def test_stages_that_have_ended_are_not_repeated(run, fitted, capsys):
-    before = model.load(run / "model")[1]
+    before = files.load(run / "model")[1]
     times = {stage: (run / stage / "fitted").stat().st_mtime_ns for stage in STAGES}
     shutil.rmtree(run / "gate")
     shutil.rmtree(run / "model")
@@ -107,7 +111,7 @@ def test_stages_that_have_ended_are_not_repeated(run, fitted, capsys):
     assert fitted("--resume", str(run)) == run
     printed = capsys.readouterr().out
     assert "gate" in printed and "single_steps" not in printed
-    chex.assert_trees_all_equal(model.load(run / "model")[1], before)
+    chex.assert_trees_all_equal(files.load(run / "model")[1], before)
     for stage in STAGES[:-1]:
         assert (run / stage / "fitted").stat().st_mtime_ns == times[stage], stage
 
@@ -120,17 +124,20 @@ def test_another_gate_for_the_specialists_of_an_earlier_run(run, fitted, capsys)
     for stage in STAGES[:-1]:
         assert f"{stage}: from {run}" in printed
     assert "gate: from" not in printed
-    config, params = model.load(other / "model")
+    config, params = files.load(other / "model")
     assert config.coefficients == "scalar"
-    chex.assert_trees_all_equal(params.nesam, model.load(run / "model")[1].nesam)
+    chex.assert_trees_all_equal(params.nesam, files.load(run / "model")[1].nesam)
     assert (other / "learning_curves.png").stat().st_size > 10_000
 
 
 def test_specialists_may_share_the_encoders_of_one(run, fitted):
     shared = fitted("--model.encoders", "shared", "--reuse", str(run))
     assert not (shared / "nesam_autoencoders").exists()
-    params, before = (model.load(place / "model")[1] for place in (shared, run))
-    chex.assert_trees_all_equal(params.nesam.encoders, before.transformer.encoders)
+    params, before = (files.load(place / "model")[1] for place in (shared, run))
+    assert len(params.encoders) == 1 and len(before.encoders) == 2
+    for name in ("elevation", "semantic", "reduce"):
+        weights = (getattr(x.encoders[0], name) for x in (params, before))
+        chex.assert_trees_all_equal(*weights)
     chex.assert_trees_all_equal(params.transformer, before.transformer)
 
 
@@ -141,7 +148,7 @@ def test_gates_are_added_to_specialists_that_stay_as_they_are(run, fitted, folde
     )
     stages = {path.name for path in further.iterdir() if path.is_dir()}
     assert stages == {"gate", "gate_1", "model"}
-    (_, before), (config, after) = (model.load(place / "model") for place in (run, further))
+    (_, before), (config, after) = (files.load(place / "model") for place in (run, further))
     assert config.gates == len(after.gate) == 2
     chex.assert_trees_all_equal(
         (after.nesam, after.transformer, after.gate.scale),
@@ -162,7 +169,7 @@ def test_a_fit_goes_on_from_a_model_with_more_drives(run, fitted, folder, tmp_pa
     further = fitted("--start", str(run / "model"), "--add", str(tmp_path / "more"))
     stages = {path.name for path in further.iterdir() if path.is_dir()}
     assert stages == {"nesam_rollouts", "transformer_rollouts", "gate", "model"}
-    before, after = (model.load(place / "model")[1] for place in (run, further))
+    before, after = (files.load(place / "model")[1] for place in (run, further))
     for part in ("nesam", "transformer"):
         old, new = getattr(before, part), getattr(after, part)
         assert any(
@@ -191,7 +198,7 @@ def test_one_specialist_alone_is_fitted_and_compared(fitted, folder, tmp_path, c
     assert "| no_terrain: transformer | " in printed
     assert "the paper, 16 steps: deformable" in printed and "| 0.790 |" in printed
     with pytest.raises(CheckpointError, match="expected vertiwm, found transformer alone"):
-        choose("vertiwm", run / "model")
+        load_model("vertiwm", run / "model")
 
 
 @pytest.mark.parametrize(
@@ -206,7 +213,7 @@ def test_one_specialist_alone_is_fitted_and_compared(fitted, folder, tmp_path, c
 )
 def test_models_without_sense_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):
-        model.ModelConfig(**settings)
+        ModelConfig(**settings)
 
 
 def test_what_cannot_be_fitted_is_named(run, folder, tmp_path, capsys):
@@ -219,10 +226,10 @@ def test_what_cannot_be_fitted_is_named(run, folder, tmp_path, capsys):
     message = refusal(door("fit"), "--data", tmp_path, "--runs", tmp_path / "runs")
     assert "expected files of drives, or folders of them named rigid" in message
     again = shutil.copytree(run, tmp_path / "again")
-    config, params = model.load(again / "model")
+    config, params = files.load(again / "model")
     other = jax.tree.map(lambda x: x + 1, params)
-    model.save(again / "model", config, other)
-    chex.assert_trees_all_equal(model.load(again / "model")[1], other)
+    files.save(again / "model", config, other)
+    chex.assert_trees_all_equal(files.load(again / "model")[1], other)
     shutil.rmtree(again / "model" / "1")
     with pytest.raises(CheckpointError, match="weights of a model"):
-        model.load(again / "model")
+        files.load(again / "model")

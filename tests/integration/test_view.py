@@ -27,7 +27,7 @@ sac:
 @pytest.fixture
 def uniform(monkeypatch):
     """Models by name are one that compiles in no time."""
-    monkeypatch.setattr(view, "choose", lambda name, weights, **_: (ConstantVelocity(), None))
+    monkeypatch.setattr(view, "load_model", lambda name, weights, **_: (ConstantVelocity(), None))
 
 
 def test_a_recorded_drive(uniform, tmp_path, capsys, monkeypatch):

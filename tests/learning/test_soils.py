@@ -10,9 +10,9 @@ from vertiwm_jax.learning.soils import SoilProblem
 from vertiwm_jax.networks import soil_predictor
 from vertiwm_jax.networks.encoder import LATENT_CHANNELS
 from vertiwm_jax.networks.soil_predictor import BOUNDS, SoilPredictor
+from vertiwm_jax.perception.features import init_pair
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.soil import PRESETS
-from vertiwm_jax.world_model.perception import Exteroception
 
 NAMES = terrain_map.STANDARD.names
 GRASS, MUD, SNOW = (NAMES.index(name) for name in ("grass", "mud", "snow"))
@@ -22,8 +22,8 @@ LATENT = jnp.zeros((16, 16, LATENT_CHANNELS))
 
 def params():
     keys = jax.random.split(jax.random.key(0))
-    encoders = Exteroception().init_params(keys[0])
-    return {"encoders": encoders, "soil": SoilPredictor().init(keys[1], LATENT, jnp.float32(0))}
+    semantic = init_pair(keys[0]).semantic
+    return {"semantic": semantic, "soil": SoilPredictor().init(keys[1], LATENT, jnp.float32(0))}
 
 
 def data(*kinds):

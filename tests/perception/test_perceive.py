@@ -11,7 +11,7 @@ from world_model.examples import driving, one, rough
 from vertiwm_jax.networks.encoder import TerrainEncoder
 from vertiwm_jax.perception import _fast
 from vertiwm_jax.perception.features import Encoders, init_pair, init_reduce, init_soil
-from vertiwm_jax.perception.perceive import _plain, perceive
+from vertiwm_jax.perception.perceive import _plain, perceive, reduced
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import patches, reveal
@@ -66,7 +66,11 @@ def places(*batch: int, seed: int = 2) -> VehicleState:
     return VehicleState(jnp.stack([x, y, z], -1), still.at[..., 2].set(yaw), still, still)
 
 
-perceived = jax.jit(perceive, static_argnames="latents")
+def look(pairs, terrain, state, latents=False):
+    return reduced(pairs, perceive(pairs, terrain, state, latents))
+
+
+perceived = jax.jit(look, static_argnames="latents")
 plain = jax.jit(_plain, static_argnames="latents")
 
 
@@ -113,7 +117,7 @@ def test_batches_are_those_of_one_at_a_time(batch, pairs, latents):
             lambda x: x.reshape(number, *x.shape[len(batch) :]), jax.jit(many)(which, states)
         )
 
-    found, expected = of_all(perceive), of_all(_plain)
+    found, expected = of_all(look), of_all(_plain)
     for i in range(number):
         same(one(found, i), one(expected, i), share=0.02)
     assert (found[0].latents is not None) == latents
@@ -191,7 +195,7 @@ def test_it_is_what_encoders_make_of_the_patches_at_the_pose():
 
 def test_the_first_layer_of_the_network_alone_learns_and_only_from_latents():
     def total(pairs, state, latents):
-        seen = perceive(pairs, world(), state, latents=latents)
+        seen = reduced(pairs, perceive(pairs, world(), state, latents=latents))
         return sum(jnp.sum(x.reduced**2) + jnp.sum(x.average) for x in seen)
 
     pairs, state = (FIRST, FIRST), places()

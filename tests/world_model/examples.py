@@ -8,11 +8,11 @@ import numpy as np
 
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.world_model.normalisation import Normalisation
-from vertiwm_jax.world_model.sizes import TransformerSize
+from vertiwm_jax.world_model.network import NetworkSize
+from vertiwm_jax.world_model.normalization import Normalization
 
-TINY = TransformerSize(layers=2, width=32, heads=2, hidden=48, channels=4)
-CONSTANTS = Normalisation(
+TINY = NetworkSize(layers=2, width=32, heads=2, hidden=48, channels=4)
+CONSTANTS = Normalization(
     state_mean=jnp.array([0.0, 0.02, 2.1, 0.0, 0.0, 0.0, 0.0, 0.0]),
     state_deviation=jnp.array([0.1, 0.1, 0.8, 0.2, 0.2, 0.2, 0.2, 0.2]),
     command_mean=jnp.array([2.2, 0.0]),

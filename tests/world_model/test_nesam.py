@@ -16,28 +16,34 @@ from world_model.examples import (
     rough,
 )
 
-from vertiwm_jax.dynamics import rollout
-from vertiwm_jax.learning import augment
+from vertiwm_jax.dynamics import along, rollout
+from vertiwm_jax.learning import augment, calibration
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.networks.soil_predictor import SoilPredictor
+from vertiwm_jax.perception.features import init_pair, init_soil
+from vertiwm_jax.perception.perceive import perceive
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
-from vertiwm_jax.world_model import choice, motion
-from vertiwm_jax.world_model.model import VertiWM
-from vertiwm_jax.world_model.nesam import Nesam, calibrate
-from vertiwm_jax.world_model.perception import Sighted
-from vertiwm_jax.world_model.sizes import BASE
-from vertiwm_jax.world_model.specialist_network import WINDOW
-from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
+from vertiwm_jax.world_model import motion, nesam_inputs, network
+from vertiwm_jax.world_model.alone import Alone
+from vertiwm_jax.world_model.nesam import Nesam
+from vertiwm_jax.world_model.network import BASE, WINDOW
+from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
 KEY, TERRAIN = jax.random.key(0), rough()
 PHYSICS = chrono_like(hmmwv())
-MODEL = Nesam(TINY)
+MODEL = Alone(Nesam(TINY))
 SCALE = 0.1 * CONSTANTS.transition_deviation
-UNTRAINED = replace(MODEL.init_params(KEY, PHYSICS, CONSTANTS), correction_scale=SCALE)
-PARAMS = moved(UNTRAINED)
+
+
+def of(nesam) -> VertiWMParams:
+    """Parameters of NeSAM alone, on the soils of the map."""
+    return VertiWMParams((), PHYSICS.vehicle, nesam=nesam)
+
+
+UNTRAINED = of(replace(Nesam(TINY).init_params(KEY, PHYSICS, CONSTANTS), correction_scale=SCALE))
+PARAMS = of(moved(UNTRAINED.nesam))
 KEEPS = jnp.linspace(0.9, 0.4, 6)
 """Share of each velocity that is left after a step of `Damped`."""
 
@@ -59,7 +65,10 @@ class Damped(Simulator):
         return motion.moved(state, increment, after), memory
 
 
-SIMPLE = replace(MODEL, simulator=Damped())
+SIMPLE = Alone(Nesam(TINY, simulator=Damped()))
+
+
+SHARP = Alone(replace(SIMPLE.specialist, gradient="exact"))
 
 
 def standing(seed: int = 0, *batch: int) -> VehicleState:
@@ -79,7 +88,7 @@ def compiled(model):
     """Most tests share one program a model: compiling the simulator takes seconds."""
     return (
         jax.jit(partial(predict, model))
-        .lower(PARAMS if isinstance(model, Nesam) else PHYSICS, standing(), commands(16), TERRAIN)
+        .lower(PARAMS if isinstance(model, Alone) else PHYSICS, standing(), commands(16), TERRAIN)
         .compile()
     )
 
@@ -94,10 +103,8 @@ def test_base_size():
     assert 400_000 < count(parameters.network) < 700_000
 
 
-def test_a_rollout_leaves_out_encoders_that_nobody_reads():
-    looking = jax.jit(MODEL.init).lower(PARAMS, TERRAIN, standing()).compile()
-    assert "convolution" in str(looking.as_text())
-    assert "convolution" not in str(compiled(MODEL).as_text())
+def test_it_sees_nothing_where_soils_are_those_of_the_map():
+    assert jax.jit(MODEL.init)(PARAMS, TERRAIN, standing()).features == ()
 
 
 def test_untrained_is_the_simulator():
@@ -106,16 +113,14 @@ def test_untrained_is_the_simulator():
     found = predicted(MODEL, UNTRAINED, state, control)
     assert float(jnp.abs(expected.position[-1] - state.position).max()) > 1
     np.testing.assert_allclose(found.vector, expected.vector, atol=3e-4)
-    alone = predicted(replace(MODEL, residual=False), PARAMS, state, control)
-    np.testing.assert_allclose(alone.vector, expected.vector, atol=3e-4)
 
 
 def test_step_adds_what_the_network_says_in_its_scale():
     state, control = standing(), commands(16)
     # With a bias alone, the output of the network is that bias.
-    network = jax.tree.map(lambda x: x, UNTRAINED.network)
-    network["params"]["head"]["bias"] = bias = jnp.linspace(-1, 1, 12)
-    found = predicted(MODEL, replace(UNTRAINED, network=network), state, control)
+    weights = jax.tree.map(lambda x: x, UNTRAINED.nesam.network)
+    weights["params"]["head"]["bias"] = bias = jnp.linspace(-1, 1, 12)
+    found = predicted(MODEL, of(replace(UNTRAINED.nesam, network=weights)), state, control)
     physics = predicted(Simulator(), PHYSICS, state, control)
     # In a mirror, it would push the same way: what is odd cancels.
     even = jnp.array([1, 0, 1, 0, 1, 0] * 2)
@@ -123,26 +128,28 @@ def test_step_adds_what_the_network_says_in_its_scale():
     np.testing.assert_allclose(one(found, 0).vector, expected.vector, atol=1e-5)
 
 
-def test_cached_steps_along_a_drive_equal_the_whole_sequence():
+def test_steps_along_a_drive_equal_the_whole_sequence():
     steps = WINDOW + 5
     drive, control = standing(1, steps), commands(steps)
 
     @jax.jit
-    def cached(params, states, commands):
-        def advance(carry, inputs):
-            state, command = inputs
-            proposed, history = SIMPLE.propose(params, TERRAIN, carry, state, command)
-            return history, proposed
+    def at_once(params, states, commands):
+        own, simulator = params.nesam, Damped()
+        physics, memories = along(
+            simulator, PHYSICS, TERRAIN, states, commands, lambda history: history
+        )
+        expected = jax.tree.map(lambda x, y: jnp.concatenate([x[:1], y[:-1]]), states, physics)
+        constants = own.normalization, own.correction_scale, params.vehicle
+        step = expected, states, commands, physics, memories
+        inputs = nesam_inputs.of(*constants, *step)
+        outputs = network._Module(TINY).apply(own.network, inputs, None)
+        mean = 0.5 * (outputs[0] + nesam_inputs.MOTION_SIGNS * outputs[1])
+        return physics, motion.corrected(physics, own.correction_scale * mean)
 
-        start = SIMPLE.init(params, TERRAIN, one(states, 0))
-        return jax.lax.scan(advance, start, (states, commands))[1]
-
-    follow = jax.jit(SIMPLE.follow)
-    at_once = follow(PARAMS, TERRAIN, drive, control)
-    physics = follow(UNTRAINED, TERRAIN, drive, control)
-    assert float(jnp.abs(physics.velocity - at_once.velocity).max(-1).min()) > 1e-3
-    one_by_one = cached(PARAMS, drive, control)
-    np.testing.assert_allclose(one_by_one.vector, at_once.vector, atol=1e-4)
+    physics, expected = at_once(PARAMS, drive, control)
+    found, _ = jax.jit(partial(along, SIMPLE))(PARAMS, TERRAIN, drive, control)
+    assert float(jnp.abs(physics.velocity - found.velocity).max(-1).min()) > 1e-3
+    np.testing.assert_allclose(found.vector, expected.vector, atol=1e-4)
 
 
 def test_place_and_heading_do_not_matter():
@@ -180,14 +187,14 @@ def test_a_mirrored_vehicle_on_mirrored_ground_drives_mirrored():
 
 
 def test_gradients_reach_all_weights_through_sixteen_steps():
-    params = replace(PARAMS, response=-0.4 * jnp.eye(12, 6, -6))
+    own = replace(PARAMS.nesam, response=-0.4 * jnp.eye(12, 6, -6))
     state, control = standing(3), commands(16)
 
     def loss(network):
-        final = one(predict(MODEL, replace(params, network=network), state, control), -1)
+        final = one(predict(MODEL, of(replace(own, network=network)), state, control), -1)
         return jnp.sum(final.vector)
 
-    gradients = jax.jit(jax.grad(loss))(PARAMS.network)
+    gradients = jax.jit(jax.grad(loss))(own.network)
     for path, leaf in jax.tree.leaves_with_path(gradients):
         assert bool(jnp.isfinite(leaf).all()), path
         assert float(jnp.abs(leaf).max()) > 0, path
@@ -199,7 +206,8 @@ def test_calibration_measures_what_physics_misses_and_how_it_answers():
     after = jax.vmap(lambda state, u: predict(Damped(), PHYSICS, state, u))(starts, control)
     states = jax.tree.map(lambda a, b: jnp.concatenate([a[:, None], b], 1), starts, after)
     worlds = replace(TERRAIN, world=jnp.zeros(drives, jnp.int32))
-    measured = jax.jit(lambda *drive: calibrate(SIMPLE, UNTRAINED, worlds, *drive))
+    constants = partial(calibration.nesam_constants, SIMPLE.specialist, UNTRAINED, worlds)
+    measured = jax.jit(lambda *drive: constants(*drive).nesam)
     params = measured(states, control)
     np.testing.assert_allclose(params.correction_scale, 0, atol=1e-4)
     # The increment is 0.02 s times the loss of velocity more than that of the mean velocity.
@@ -216,16 +224,16 @@ def test_calibration_measures_what_physics_misses_and_how_it_answers():
 
 def test_the_mean_gradient_is_exact_where_physics_answers_alike_everywhere():
     change = jnp.diag(KEEPS - 1)
-    params = replace(PARAMS, response=jnp.concatenate([-0.02 * change, change]))
+    own = replace(PARAMS.nesam, response=jnp.concatenate([-0.02 * change, change]))
     state, control = standing(3), commands(16)
 
     def loss(network, model):
-        final = one(predict(model, replace(params, network=network), state, control), -1)
+        final = one(predict(model, of(replace(own, network=network)), state, control), -1)
         return jnp.sum(final.vector)
 
     value = jax.jit(jax.value_and_grad(loss), static_argnums=1)
-    mean, by_mean = value(PARAMS.network, SIMPLE)
-    exact, by_exact = value(PARAMS.network, replace(SIMPLE, gradient="exact"))
+    mean, by_mean = value(own.network, SIMPLE)
+    exact, by_exact = value(own.network, SHARP)
     np.testing.assert_allclose(mean, exact, rtol=1e-4)
     for a, b in zip(*map(jax.tree.leaves, (by_mean, by_exact)), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-2 * float(jnp.abs(b).max()))
@@ -246,44 +254,30 @@ def test_jit_changes_nothing():
 
 
 def test_predicted_soils_are_those_of_the_predictor_wherever_it_drives():
-    """Against a map whose every soil is what the predictor says of the latent."""
-    state, control = standing(), commands(1)
-    model = Nesam(TINY, residual=False, soil="predicted")
-    perception = model.init(PARAMS, TERRAIN, state).perception
-    soil = SoilPredictor().apply(PARAMS.soil, perception.semantic, jnp.float32(0))
-    soils = jax.tree.map(lambda x: jnp.broadcast_to(x, TERRAIN.deformable.shape), soil)
-    soils = replace(soils, unit_weight=query.soils(TERRAIN).unit_weight)
-    told = replace(TERRAIN.with_soils(soils), deformable=jnp.ones_like(TERRAIN.deformable))
+    """Against a map whose every soil is what the predictor says of the latents."""
+    state, command = standing(), one(commands(1), 0)
+    pair = replace(init_pair(KEY), soil=init_soil(KEY))
+    seeing = replace(UNTRAINED, encoders=(pair,))
+    soil = perceive((pair,), TERRAIN, state)[0].soil
+    unit_weight = query.soils(TERRAIN).unit_weight
+    told = TERRAIN.with_soils(replace(soil, unit_weight=unit_weight))
+    told = replace(told, deformable=jnp.ones_like(TERRAIN.deformable))
     soft = replace(TERRAIN, deformable=told.deformable)
-    physics = Nesam(TINY, residual=False)
     found, expected, other = (
-        run(PARAMS, terrain, run_init(PARAMS, terrain, state), state, one(control, 0))[0].vector
-        for run, run_init, terrain in (
-            (model.step, model.init, soft),
-            (physics.step, physics.init, told),
-            (physics.step, physics.init, soft),
-        )
+        MODEL.step(params, terrain, MODEL.init(params, terrain, state), state, command)[0].vector
+        for params, terrain in ((seeing, soft), (UNTRAINED, told), (UNTRAINED, soft))
     )
     np.testing.assert_array_equal(found, expected)
     assert float(jnp.abs(found - other).max()) > 1e-5
 
 
-def test_exact_lets_commands_move_what_the_mean_gradient_holds():
-    model = replace(SIMPLE, residual=False)
-    history = model.init(PARAMS, TERRAIN, driving())
+def test_exact_gradients_let_commands_move_what_the_mean_gradient_holds():
+    history = SIMPLE.init(UNTRAINED, TERRAIN, driving())
     command = Command(jnp.float32(2), jnp.float32(0.1))
 
     def speed(model, command):
-        return model.step(PARAMS, TERRAIN, history, driving(), command)[0].velocity[0]
+        return model.step(UNTRAINED, TERRAIN, history, driving(), command)[0].velocity[0]
 
-    sharp = choice.exact(model)
-    np.testing.assert_array_equal(speed(model, command), speed(sharp, command))
-    assert jax.grad(speed, argnums=1)(model, command).speed == 0
-    np.testing.assert_allclose(jax.grad(speed, argnums=1)(sharp, command).speed, 0.1, rtol=1e-5)
-
-
-def test_exact_reaches_nesam_inside_other_models():
-    fused = VertiWM(TransformerSpecialist(TINY), MODEL)
-    assert choice.exact(fused) == replace(fused, nesam=replace(MODEL, gradient="exact"))
-    assert choice.exact(Sighted(fused)) == Sighted(choice.exact(fused))
-    assert choice.exact(Simulator()) == Simulator()
+    np.testing.assert_array_equal(speed(SIMPLE, command), speed(SHARP, command))
+    assert jax.grad(speed, argnums=1)(SIMPLE, command).speed == 0
+    np.testing.assert_allclose(jax.grad(speed, argnums=1)(SHARP, command).speed, 0.1, rtol=1e-5)

@@ -21,8 +21,6 @@ from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import motion
-from vertiwm_jax.world_model.choice import exact
-from vertiwm_jax.world_model.model import VertiWM
 from vertiwm_jax.world_model.nesam import Nesam
 
 MARGIN = 0.05
@@ -139,9 +137,9 @@ class SoilFilter:
 
         terrain: the map as it was, of which only the soils are doubted. To measure more often than
         every H steps would count them twice. Raises `ValueError` for a model that does not take
-        soils from the map.
+        soils from the map, or whose gradients are not exact.
         """
-        model = _differentiable(model)
+        _check(model, params)
         states = VehicleState.from_vector(belief.states)
         start, end = (jax.tree.map(lambda x, i=i: x[i], states) for i in (0, -1))
         commands = Command.from_vector(belief.commands)
@@ -210,14 +208,14 @@ def believed(terrain: TerrainMap, belief: SoilBelief) -> TerrainMap:
     return terrain.with_soils(soil_predictor.of_shares(shares, unit_weight))
 
 
-def _differentiable(model: Dynamics) -> Dynamics:
-    """The same model, whose predictions have their exact gradient with respect to soils.
-
-    `ValueError` for one that predicts soils from what the ground looks like.
-    """
-    nesam = model.nesam if isinstance(model, VertiWM) else model
-    if isinstance(nesam, Nesam) and nesam.soil != "map":
+def _check(model: Dynamics, params: Params) -> None:
+    """`ValueError` for a model whose predictions do not tell how they depend on soils."""
+    nesam = getattr(model, "nesam", getattr(model, "specialist", None))
+    if isinstance(nesam, Nesam) and nesam.gradient != "exact":
         raise ValueError(
-            f"soil: expected 'map' to adapt the soils of the map, found {nesam.soil!r}"
+            "model: expected one of load_model(exact_gradient=True) to adapt soils, found one "
+            "without exact gradients"
         )
-    return exact(model)
+    encoders = getattr(params, "encoders", ())
+    if encoders and encoders[-1].soil is not None:
+        raise ValueError("soil: expected 'map' to adapt the soils of the map, found 'predicted'")

@@ -19,6 +19,8 @@ from vertiwm_jax.env.agent import Policy
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig
+from vertiwm_jax.models.registry import load_encoders
+from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.rl.policy import load_policy
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.simulators import chrono, collection, excitation, processes
@@ -30,8 +32,6 @@ from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import files, worlds
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.worlds import Difficulty, Kind, WorldConfig
-from vertiwm_jax.world_model.choice import eyes
-from vertiwm_jax.world_model.perception import Eyes
 
 SHORTEST = 0.8
 """Share of its time after which a drive that ended early is kept; others are tried again."""
@@ -91,7 +91,7 @@ class Task:
 
     command: Collect
     vehicle: Vehicle
-    learned: tuple[Policy, NavigationConfig, Eyes | None] | None
+    learned: tuple[Policy, NavigationConfig, Encoders | None] | None
     terrain: TerrainMap
     world: int
     drive: int
@@ -172,13 +172,13 @@ def _terrain(command: Collect, scale: float) -> TerrainMap:
     return worlds.generate(jax.random.split(jax.random.key(command.seed), count), config, scale)
 
 
-def _learned(command: Collect) -> tuple[Policy, NavigationConfig, Eyes | None] | None:
+def _learned(command: Collect) -> tuple[Policy, NavigationConfig, Encoders | None] | None:
     """What the run has learned, in host memory, how it is to be driven, and what it sees by."""
     run = command.policy
     if run is None:
         return None
     policy = load_policy(run).on(vehicle.load(command.vehicle))
-    seen_by = eyes(policy.config.weights) if policy.task.embeddings else None
+    seen_by = load_encoders(policy.config.weights) if policy.task.embeddings else None
     acting, seen_by = jax.device_get((policy.acting, seen_by))
     return acting, policy.task, seen_by
 

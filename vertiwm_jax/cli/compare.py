@@ -20,6 +20,7 @@ from vertiwm_jax.evaluation import external, policy_table, report
 from vertiwm_jax.evaluation.external import Arena
 from vertiwm_jax.evaluation.policy_table import TrainingCost
 from vertiwm_jax.evaluation.report import Results
+from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import TRAININGS, TrainConfig
 from vertiwm_jax.runs import Run
@@ -27,7 +28,6 @@ from vertiwm_jax.simulators import processes
 from vertiwm_jax.simulators.processes import Map
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.training import keep_compiled
-from vertiwm_jax.world_model.choice import ModelName
 
 Policies = Callable[[TerrainMap], Mapping[str, Policy | Agent]]
 """Policies that drive on any worlds of one kind of map."""

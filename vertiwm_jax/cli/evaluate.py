@@ -34,6 +34,8 @@ from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, hmmwv
+from vertiwm_jax.models.config import SoilSource
+from vertiwm_jax.models.registry import ModelName, load_fitted, load_model
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import TrainConfig
 from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
@@ -42,8 +44,6 @@ from vertiwm_jax.rl.shooting import Shooting, ShootingConfig
 from vertiwm_jax.simulators import processes
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain.soil import PRESETS
-from vertiwm_jax.world_model.choice import ModelName, choose, exact, fitted
-from vertiwm_jax.world_model.nesam import SoilSource
 
 
 @settings
@@ -193,9 +193,11 @@ def _predict(command: Prediction) -> None:
     longest = max(command.horizon)
     test = TestWindows.of(drives, terrain, command.context, longest, command.stride)
     driven = vehicle.load(command.vehicle).vehicle
-    chosen = command.weights, command.soil, driven
     models: dict[str, tuple[Dynamics, Params]] = {
-        **{name: choose(name, *chosen) for name in command.models},
+        **{
+            name: load_model(name, command.weights, vehicle=driven, soil=command.soil)
+            for name in command.models
+        },
         **_compared(command.compare),
         "kinematic bicycle": (KinematicBicycle(), bicycle_of(driven)),
         "constant velocity": (ConstantVelocity(), None),
@@ -216,7 +218,7 @@ def _adapt(command: Adaptation) -> None:
     drives, terrain = dataset.load(command.data, command.split)
     drives = jax.tree.map(lambda x: x[:: command.every], drives)
     index = adaptation.windows_on_soil(drives, terrain)
-    model, params = choose(command.model, command.weights, "map")
+    model, params = load_model(command.model, command.weights, soil="map", exact_gradient=True)
     wrong = adaptation.mistaken(terrain, PRESETS[command.wrong])
     adapted = adaptation.adapt(command.filter, model, params, wrong, drives)
     found = adaptation.errors(model, params, terrain, wrong, adapted, drives, index)
@@ -231,7 +233,7 @@ def _calibrate(command: Calibration) -> None:
         TestWindows.of(*dataset.load(command.data, split), *lengths)
         for split in ("validation", "test")
     )
-    model = choose("vertiwm", command.weights)
+    model = load_model("vertiwm", command.weights)
     before, known = calibration.signs(*model, measured)
     errors, found = calibration.signs(*model, tested)
     measure, (best, order) = calibration.Calibration.measure, next(iter(found.items()))
@@ -256,7 +258,7 @@ def _compared(folders: Sequence[Path]) -> dict[str, tuple[Dynamics, Params]]:
     return {
         f"{name if names.count(name) == 1 else folder.name}: {part}": model
         for name, folder in zip(names, folders, strict=True)
-        for part, model in fitted(folder / "model").items()
+        for part, model in load_fitted(folder / "model").items()
     }
 
 
@@ -282,8 +284,8 @@ def _navigate(command: Navigation) -> None:
         env = NavigationEnv(dynamics, config.navigation)
         policies = {"mppi": MPPI(env=env, dynamics=weights, config=command.mppi)} | policies
     elif command.policy == "shooting":
-        dynamics, weights = experiment.dynamics(config, command.shooting.model)
-        env = NavigationEnv(exact(dynamics), config.navigation)
+        dynamics, weights = experiment.dynamics(config, command.shooting.model, exact_gradient=True)
+        env = NavigationEnv(dynamics, config.navigation)
         shooting = Shooting(env=env, dynamics=weights, config=command.shooting)
         policies = {"shooting": shooting} | policies
     elif command.policy == "straight":

@@ -17,10 +17,10 @@ from vertiwm_jax.config import ConfigError
 from vertiwm_jax.deploy import description, run_policy, stablehlo
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.models.registry import load_encoders
+from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.rl.learned import Corrected, MeanAction
 from vertiwm_jax.rl.policy import load_policy
-from vertiwm_jax.world_model.choice import eyes
-from vertiwm_jax.world_model.perception import Eyes
 
 Record = Callable[..., bytes]
 
@@ -42,7 +42,7 @@ def run(name: str, words: Sequence[str]) -> None:
     folder = command.output or command.run / "export"
     record, policy = _recorder(), load_policy(command.run, command.seed)
     config = policy.config
-    seen_by = eyes(config.weights) if policy.task.embeddings else None
+    seen_by = load_encoders(config.weights) if policy.task.embeddings else None
     told = policy.task, config.vehicle.vehicle, config.action_repeat
     with runs.new_folder(folder) as unfinished:
         for file, data in files(policy.acting, seen_by, *told, record).items():
@@ -52,7 +52,7 @@ def run(name: str, words: Sequence[str]) -> None:
 
 def files(
     policy: Corrected | MeanAction,
-    eyes: Eyes | None,
+    encoders: Encoders | None,
     config: NavigationConfig,
     vehicle: Vehicle,
     held: int,
@@ -60,7 +60,7 @@ def files(
 ) -> dict[str, bytes | str]:
     """What the folder of a policy holds, by name.
 
-    eyes: of a policy that sees embeddings; config, vehicle, held: as in `description.about`;
+    encoders: of a policy that sees embeddings; config, vehicle, held: as in `description.about`;
     record: `onnx_graph.record`.
     """
     about, weights = description.about(policy, config, vehicle, held), description.weights(policy)
@@ -74,7 +74,7 @@ def files(
         # The key is not used: no learned policy is random.
         "policy.stablehlo": stablehlo.policy(lambda seen: policy(seen, jax.random.key(0)), size),
         "route.stablehlo": stablehlo.route(config, vehicle),
-        "observe.stablehlo": stablehlo.observe(config, vehicle, eyes),
+        "observe.stablehlo": stablehlo.observe(config, vehicle, encoders),
         "run_policy.py": Path(run_policy.__file__).read_bytes(),
     }
 

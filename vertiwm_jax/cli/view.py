@@ -16,10 +16,10 @@ from vertiwm_jax.env.suites import Suite
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV
+from vertiwm_jax.models.registry import ModelName, load_model
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.viewing import driven, movie, recorded
 from vertiwm_jax.viewing.scene import Scene
-from vertiwm_jax.world_model.choice import ModelName, choose
 
 
 @settings
@@ -141,5 +141,5 @@ def _recorded(command: View) -> Scene:
                 f"{file}: {name}: is of a policy, expected the folder of a run, found none"
             )
     shown = vehicle.load(command.vehicle or HMMWV).vehicle
-    model = choose(command.model, command.weights, vehicle=shown)
+    model = load_model(command.model, command.weights, vehicle=shown)
     return replace(recorded.load(file, number, command.model, *model), vehicle=shown)

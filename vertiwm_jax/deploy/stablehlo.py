@@ -12,10 +12,11 @@ from vertiwm_jax.env import observation
 from vertiwm_jax.env.route import Routes
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.perception.features import Encoders
+from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.classes import STANDARD
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.perception import Eyes
 
 PLATFORMS = ("cpu", "cuda")
 
@@ -31,13 +32,13 @@ def route(config: NavigationConfig, vehicle: Vehicle) -> bytes:
     return _serialised(partial(_route, config, vehicle), *_map_arrays(), _floats(3))
 
 
-def observe(config: NavigationConfig, vehicle: Vehicle, eyes: Eyes | None) -> bytes:
+def observe(config: NavigationConfig, vehicle: Vehicle, encoders: Encoders | None) -> bytes:
     """`observation.observe` of map arrays, for maps of any size; the arguments of `_observe`.
 
-    With eyes, the observation ends with what they see.
+    With encoders, the observation ends with the latents that they see.
     """
     seen = _floats(config.route.cells, config.route.cells), _floats(12), _floats(3), _floats(2)
-    return _serialised(partial(_observe, vehicle, eyes), *_map_arrays(), *seen)
+    return _serialised(partial(_observe, vehicle, encoders), *_map_arrays(), *seen)
 
 
 def _route(config: NavigationConfig, vehicle: Vehicle, *arguments: jax.Array) -> jax.Array:
@@ -46,7 +47,7 @@ def _route(config: NavigationConfig, vehicle: Vehicle, *arguments: jax.Array) ->
     return config.route_to(_terrain(*arrays), vehicle, goal[:2]).cost[0]
 
 
-def _observe(driven: Vehicle, eyes: Eyes | None, *arguments: jax.Array) -> jax.Array:
+def _observe(driven: Vehicle, encoders: Encoders | None, *arguments: jax.Array) -> jax.Array:
     """`[O]` seen on one world, given by the arguments of `_terrain`; what follows them:
 
     route: `[n, n]`, of `_route`; state: `[12]`, as `VehicleState.vector`; goal: `[3]` m; action:
@@ -56,7 +57,9 @@ def _observe(driven: Vehicle, eyes: Eyes | None, *arguments: jax.Array) -> jax.A
     terrain, vehicle = _terrain(*arrays), VehicleState.from_vector(state)
     route = Routes(cost[None], jnp.int32(0))
     seen = observation.observe(terrain, driven, vehicle, goal, route, action)
-    return observation.with_embedding(seen, eyes(terrain, vehicle).latent) if eyes else seen
+    if encoders is None:
+        return seen
+    return observation.with_embedding(seen, embed(encoders, terrain, vehicle))
 
 
 def _terrain(

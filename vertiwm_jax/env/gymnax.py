@@ -16,9 +16,9 @@ from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import NavigationConfig, TaskParams
 from vertiwm_jax.env.tasks import random_tasks
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.models.registry import ModelName, load_encoders, load_model
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.worlds import WorldConfig
-from vertiwm_jax.world_model.choice import ModelName, choose, lean
 
 NAME = "OffRoadNavigation-v0"
 
@@ -44,10 +44,9 @@ class ProceduralNavigation(NavigationEnv):
         config: NavigationConfig = NavigationConfig(),
         **settings,
     ) -> Self:
-        """The environment in a model of `world_model.choice`, with any of the other settings."""
-        dynamics, _ = choose(model)
-        seen = dynamics if config.embeddings else lean(dynamics)
-        return cls(seen, config, model=model, **settings)
+        """The environment in a model of `load_model`, with any of the other settings."""
+        dynamics, _ = load_model(model, embeddings=config.embeddings)
+        return cls(dynamics, config, model=model, **settings)
 
     @property
     def default_params(self) -> TaskParams:
@@ -55,7 +54,8 @@ class ProceduralNavigation(NavigationEnv):
         world_key, task_key = jax.random.split(jax.random.key(self.seed))
         terrain = worlds.generate(jax.random.split(world_key, self.number), self.relief)
         tasks = random_tasks(task_key, terrain, self.starts, hmmwv())
-        return self.make_params(choose(self.model)[1], terrain, tasks)
+        encoders = load_encoders() if self.config.embeddings else None
+        return self.make_params(load_model(self.model)[1], terrain, tasks, encoders=encoders)
 
 
 gymnax.register(NAME, ProceduralNavigation.of)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from gymnax.environments import environment, spaces
 
-from vertiwm_jax.dynamics import EMBEDDING_SHAPE, Dynamics, Params, disagreement, spread, step
+from vertiwm_jax.dynamics import Dynamics, Params, disagreement, spread, step
 from vertiwm_jax.env import observation, suites
 from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
 from vertiwm_jax.env.resets import ResetPool
@@ -20,11 +20,12 @@ from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState, see
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason, edge_distance, first_ending, is_terminal
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, hmmwv, load_vehicle
+from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
 from vertiwm_jax.networks.policy import Senses
+from vertiwm_jax.perception.features import EMBEDDING_SHAPE, Encoders
 from vertiwm_jax.state import STEP_SECONDS, VehicleState
 from vertiwm_jax.terrain import obstacles, query, reveal
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.choice import Imagined, lean, load_model
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +41,12 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
     variation: RandomizationConfig = RandomizationConfig()
 
     def make_params(
-        self, dynamics: Params, terrain: TerrainMap, tasks: Tasks, vehicle: Vehicle | None = None
+        self,
+        dynamics: Params,
+        terrain: TerrainMap,
+        tasks: Tasks,
+        vehicle: Vehicle | None = None,
+        encoders: Encoders | None = None,
     ) -> TaskParams:
         """Parameters whose pool of starts is `tasks`, each settled on the ground by the model.
 
@@ -49,22 +55,28 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
             terrain: the worlds.
             tasks: on these worlds.
             vehicle: what the model moves; an HMMWV by default.
+            encoders: by which policies see the ground, where the model does not keep what it sees.
 
         Raises:
             ValueError: names the first task that cannot be driven, or whose settled state is not
                 finite.
         """
-        return self._pool.settled(dynamics, vehicle or hmmwv(), terrain, tasks)
+        return self._pool.settled(dynamics, vehicle or hmmwv(), encoders, terrain, tasks)
 
     def shapes(
-        self, dynamics: Params, terrain: TerrainMap, tasks: Tasks, vehicle: Vehicle | None = None
+        self,
+        dynamics: Params,
+        terrain: TerrainMap,
+        tasks: Tasks,
+        vehicle: Vehicle | None = None,
+        encoders: Encoders | None = None,
     ) -> TaskParams:
         """What `make_params` gives, but for the starts, of which only shapes are known.
 
         Enough to restore what was learned with such parameters, or to compile what will be, without
         settling anything. Tasks that cannot be driven raise as there.
         """
-        return self._pool.shapes(dynamics, vehicle or hmmwv(), terrain, tasks)
+        return self._pool.shapes(dynamics, vehicle or hmmwv(), encoders, terrain, tasks)
 
     def start(self, params: TaskParams, index: jax.Array) -> tuple[jax.Array, TaskState]:
         """Observation and state of start `[]` of the pool."""
@@ -176,10 +188,11 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         action: int | float | jax.Array | None,
         params: TaskParams,
     ) -> jax.Array:
-        """`[O]` float32, see `observation.observe`, and the model's embedding of the ground."""
+        """`[O]` float32, see `observation.observe`, and the ground as encoders see it."""
         del key, action
         routes = params.routes.select(state.route)
-        return see(self.config, params.believed(state), params.vehicle, routes, state)
+        terrain = params.believed(state)
+        return see(self.config, terrain, params.vehicle, routes, state, params.encoders)
 
     def is_terminated(self, state: TaskState, params: TaskParams) -> jax.Array:
         """Whether the task itself is over."""
@@ -261,6 +274,7 @@ def make_env(
     if terrain is None:
         terrain = suites.suite_worlds(GroundConfig(suite_worlds=2), jax.random.key(seed))
     dynamics, params = load_model(model, weights, vehicle=driven, embeddings=config.embeddings)
-    env = NavigationEnv(dynamics if config.embeddings else lean(dynamics), config)
+    env = NavigationEnv(dynamics, config)
+    encoders = load_encoders(weights) if config.embeddings else None
     tasks = suites.test_tasks(GroundConfig(pairs=pairs), terrain)
-    return env, env.make_params(params, terrain, tasks, driven)
+    return env, env.make_params(params, terrain, tasks, driven, encoders)

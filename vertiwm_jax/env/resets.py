@@ -16,6 +16,7 @@ from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState, see
 from vertiwm_jax.env.tasks import TaskError, Tasks
 from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import patches, query, reveal
 from vertiwm_jax.terrain.map import TerrainMap
@@ -35,7 +36,12 @@ class ResetPool:
     variation: RandomizationConfig
 
     def settled(
-        self, weights: Params, vehicle: Vehicle, terrain: TerrainMap, pool: Tasks
+        self,
+        weights: Params,
+        vehicle: Vehicle,
+        encoders: Encoders | None,
+        terrain: TerrainMap,
+        pool: Tasks,
     ) -> TaskParams:
         """As `NavigationEnv.make_params`."""
         config = self.config
@@ -47,7 +53,9 @@ class ResetPool:
         together, numbered = _in_turns(pool)
         settle = parallel.shared_out(partial(_settle_once, self), together)
         states, seen = parallel.in_turns(
-            lambda some: settle(weights, vehicle, terrain, routes, *some), numbered, together
+            lambda some: settle(weights, vehicle, encoders, terrain, routes, *some),
+            numbered,
+            together,
         )
         finite = np.all(np.isfinite(states.vehicle.vector), axis=-1)
         if not finite.all():
@@ -58,10 +66,15 @@ class ResetPool:
                 f"{int(pool.world[i])}, start {np.asarray(pool.start)[i].tolist()}); "
                 f"{np.sum(~finite)} of {finite.size} tasks are so"
             )
-        return self._params(weights, vehicle, terrain, routes, states, seen)
+        return self._params(weights, vehicle, encoders, terrain, routes, states, seen)
 
     def shapes(
-        self, weights: Params, vehicle: Vehicle, terrain: TerrainMap, pool: Tasks
+        self,
+        weights: Params,
+        vehicle: Vehicle,
+        encoders: Encoders | None,
+        terrain: TerrainMap,
+        pool: Tasks,
     ) -> TaskParams:
         """As `NavigationEnv.shapes`."""
         self._check(vehicle, terrain, pool)
@@ -72,9 +85,9 @@ class ResetPool:
         shapes = parallel.shapes(partial(_settle, self), together)
         states, seen = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct((len(pool.world), *x.shape[1:]), x.dtype),
-            shapes(weights, vehicle, terrain, routes, *some),
+            shapes(weights, vehicle, encoders, terrain, routes, *some),
         )
-        return self._params(weights, vehicle, terrain, routes, states, seen)
+        return self._params(weights, vehicle, encoders, terrain, routes, states, seen)
 
     def _check(self, vehicle: Vehicle, terrain: TerrainMap, pool: Tasks) -> None:
         """`ValueError` names what cannot be seen, or the first task that cannot be driven."""
@@ -87,6 +100,7 @@ class ResetPool:
         self,
         weights: Params,
         vehicle: Vehicle,
+        encoders: Encoders | None,
         terrain: TerrainMap,
         routes: Routes,
         states: TaskState,
@@ -96,6 +110,7 @@ class ResetPool:
             max_steps_in_episode=jnp.int32(round(self.config.horizon_seconds / STEP_SECONDS)),
             dynamics=weights,
             vehicle=jax.tree.map(jnp.asarray, vehicle),
+            encoders=encoders,
             terrain=terrain,
             routes=routes,
             starts=states,
@@ -116,6 +131,7 @@ def _settle(
     starts: ResetPool,
     dynamics: Params,
     vehicle: Vehicle,
+    encoders: Encoders | None,
     terrain: TerrainMap,
     routes: Routes,
     pool: Tasks,
@@ -140,6 +156,7 @@ def _settle(
 
     def start(
         vehicle: Vehicle,
+        encoders: Encoders | None,
         terrain: TerrainMap,
         routes: Routes,
         task: Tasks,
@@ -163,7 +180,7 @@ def _settle(
             belief=reveal.begin(config.reveal, selected, at_rest.position, at_rest.rpy[2]),
         )
         believed = dataclasses.replace(selected, belief=state.belief)
-        return state, see(config, believed, vehicle, routes.select(number), state)
+        return state, see(config, believed, vehicle, routes.select(number), state, encoders)
 
     placed = parallel.vmap(settle, (None, None, None, 0))(dynamics, vehicle, terrain, pool)
     # Steps of all, and not all steps of each: inside of `vmap`, a scan is traced again until it is
@@ -172,8 +189,8 @@ def _settle(
     settled, _ = jax.lax.scan(
         lambda placed, _: (stand_all(placed), None), placed, length=config.settle_steps
     )
-    start_all = parallel.vmap(start, (None, None, None, 0, 0, 0))
-    return start_all(vehicle, terrain, routes, pool, numbers, settled)
+    start_all = parallel.vmap(start, (None, None, None, None, 0, 0, 0))
+    return start_all(vehicle, encoders, terrain, routes, pool, numbers, settled)
 
 
 # Apart, for what is traced inside of something else, as for its shapes, has no compiler options.

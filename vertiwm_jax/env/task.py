@@ -8,16 +8,14 @@ from flax import struct
 from gymnax.environments import environment
 
 from vertiwm_jax.config import settings
-from vertiwm_jax.dynamics import (
-    History,
-    Params,
-    embedding,
-)
+from vertiwm_jax.dynamics import History, Params, embedding
 from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.randomization import DomainRandomization
 from vertiwm_jax.env.reward import RewardConfig
 from vertiwm_jax.env.route import RouteConfig, Routes
 from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.perception.features import Encoders
+from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.map import TerrainMap
@@ -37,7 +35,7 @@ class NavigationConfig:
     plausible_speed, plausible_height: m/s, and m from the ground, beyond which a model diverged.
     plausible_disagreement: m by which its parts may disagree in a step before it has diverged.
     settle_steps: steps of standing still before a start is handed out.
-    embeddings: whether an observation ends with the ground as the model's encoders see it.
+    embeddings: whether an observation ends with the ground as a Transformer's encoders see it.
     route: how the way to the goal is found; it is straight where the map is not all known.
     reveal: what sensors reveal of a map that is not known; by default all of it is.
     """
@@ -105,6 +103,7 @@ class TaskParams(environment.EnvParams):
     terrain: all worlds; routes: to all goals of the pool.
     starts, start_observation: leaves `[P, ...]` and `[P, O]`, the pool that resets draw from.
     max_steps_in_episode: `[]` int32.
+    encoders: by which policies see the ground, where the model's histories do not have that.
     """
 
     dynamics: Params
@@ -113,6 +112,7 @@ class TaskParams(environment.EnvParams):
     routes: Routes
     starts: TaskState
     start_observation: jax.Array
+    encoders: Encoders | None = None
 
     @property
     def pool_size(self) -> int:
@@ -138,12 +138,22 @@ def see(
     vehicle: Vehicle,
     routes: Routes,
     state: TaskState,
+    encoders: Encoders | None,
 ) -> jax.Array:
-    """`[O]` float32, see `observation.observe`, and the model's embedding of the ground.
+    """`[O]` float32, see `observation.observe`, and the ground as encoders see it.
 
-    terrain: as far as the vehicle has seen it; routes: with that to its goal selected.
+    terrain: as far as the vehicle has seen it; routes: with that to its goal selected; encoders: of
+    `TaskParams`. `ValueError` where there is nothing to see by.
     """
     seen = observation.observe(terrain, vehicle, state.vehicle, state.goal, routes, state.action)
     if not config.embeddings:
         return seen
-    return observation.with_embedding(seen, embedding(state.history))
+    latents = embedding(state.history)
+    if latents is None:
+        if encoders is None:
+            raise ValueError(
+                "embeddings: expected a model that was loaded with them, or encoders to see by, "
+                "found neither; see models.registry.load_encoders"
+            )
+        latents = embed(encoders, terrain, state.vehicle)
+    return observation.with_embedding(seen, latents)

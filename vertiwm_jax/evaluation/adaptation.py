@@ -14,7 +14,7 @@ from vertiwm_jax.evaluation.prediction import BATCH, Interval, bootstrap
 from vertiwm_jax.evaluation.tables import markdown
 from vertiwm_jax.learning import windows as recorded
 from vertiwm_jax.learning.dataset import Drives
-from vertiwm_jax.learning.rollouts import open_loop
+from vertiwm_jax.learning.objectives import open_loop
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.learning.windows import GROUNDS, WindowIndex, Windows
 from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage

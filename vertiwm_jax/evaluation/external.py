@@ -17,6 +17,7 @@ from vertiwm_jax.env.task import TaskParams
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.evaluation.report import Judge
 from vertiwm_jax.mechanics.vehicle import HMMWV
+from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import Task, TaskConfig
 from vertiwm_jax.runs import Progress
@@ -27,7 +28,6 @@ from vertiwm_jax.simulators.following import AgentPilot
 from vertiwm_jax.simulators.processes import Map
 from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.choice import ModelName
 
 Arena = ModelName | Literal["chrono"]
 """What moves a vehicle whose policy is judged."""

@@ -14,9 +14,9 @@ from vertiwm_jax.env.navigation import make_env
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle
+from vertiwm_jax.models.registry import Imagined
 from vertiwm_jax.rl.policy import Policy as Trained
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.choice import Imagined
 
 
 def evaluate(

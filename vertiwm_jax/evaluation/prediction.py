@@ -15,13 +15,14 @@ from vertiwm_jax.evaluation.published import POSITION_ERRORS
 from vertiwm_jax.evaluation.tables import markdown
 from vertiwm_jax.learning import windows as recorded
 from vertiwm_jax.learning.dataset import Auxiliary, Drives
-from vertiwm_jax.learning.rollouts import open_loop
+from vertiwm_jax.learning.objectives import open_loop
 from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.mechanics.simulator import SimulatorHistory
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.model import VertiWMHistory
+from vertiwm_jax.world_model.alone import AloneHistory
 from vertiwm_jax.world_model.nesam import NesamHistory
+from vertiwm_jax.world_model.verti_wm import VertiWMHistory
 
 MEASURES = {
     "position": "m",
@@ -111,7 +112,7 @@ class Reading(NamedTuple):
 def modelled(history: History) -> Auxiliary | None:
     """What a model keeps of its wheels, if it has any; forces are of the last sub-step."""
     match history:
-        case VertiWMHistory(nesam=specialist):
+        case VertiWMHistory(nesam=specialist) | AloneHistory(specialist=specialist):
             return modelled(specialist)
         case NesamHistory(simulator=memory):
             return modelled(memory)

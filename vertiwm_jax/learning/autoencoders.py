@@ -1,7 +1,7 @@
 """Training of the terrain autoencoders to reconstruct patches of a collection's ground."""
 
 from dataclasses import dataclass
-from typing import Self, cast
+from typing import Any, Self, cast
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,6 @@ from vertiwm_jax.networks.encoder import TerrainAutoencoder
 from vertiwm_jax.terrain import patches, query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.patches import PATCH_PIXELS, RELIEF_METRES, Patches
-from vertiwm_jax.world_model.perception import EncoderParams
 
 _ELEVATION, _SEMANTIC = TerrainAutoencoder(1), TerrainAutoencoder(3)
 _NETWORKS = {"elevation": _ELEVATION, "semantic": _SEMANTIC}
@@ -150,11 +149,9 @@ def near(data: PatchData, key: jax.Array, config: AutoencoderConfig) -> Places:
     return Places(position, yaw, places.world)
 
 
-def encoders(params: Params) -> EncoderParams:
-    """The encoders of a pair of autoencoders, without the decoders."""
-    return EncoderParams(
-        **{name: {"params": params[name]["params"]["encoder"]} for name in _NETWORKS}
-    )
+def encoders(params: Params) -> dict[str, Any]:
+    """The encoders `elevation` and `semantic` of a pair of autoencoders, without the decoders."""
+    return {name: {"params": params[name]["params"]["encoder"]} for name in _NETWORKS}
 
 
 def reconstruct(params: Params, seen: Patches) -> Patches:

@@ -13,11 +13,11 @@ from vertiwm_jax.config import ConfigError, settings
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.learning import pipeline
 from vertiwm_jax.learning.pipeline import PipelineConfig
+from vertiwm_jax.models import files
+from vertiwm_jax.models.registry import load_fitted
 from vertiwm_jax.runs import Run
 from vertiwm_jax.training import keep_compiled
-from vertiwm_jax.world_model import model
-from vertiwm_jax.world_model.choice import fitted
-from vertiwm_jax.world_model.model import VertiWMParams
+from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
 _log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ def run(config: FitConfig) -> Path:
         key = jax.random.key(config.seed)
         folders = config.data + config.add
         params = pipeline.fit(config, folders, key, run, config.reuse, start)
-        model.save(run.folder / "model", config.model, params)
+        files.save(run.folder / "model", config.model, params)
     return run.folder
 
 
@@ -103,7 +103,7 @@ def fit(
     data = [drives] if isinstance(drives, str | Path) else drives
     changed = settings | {"data": tuple(map(Path, data)), "runs": Path(runs)}
     changed |= {"start": Path(start)} if start else {}
-    found = fitted(run(replace(chosen, **changed)) / "model")
+    found = load_fitted(run(replace(chosen, **changed)) / "model")
     return found.get("vertiwm") or next(iter(found.values()))
 
 
@@ -112,7 +112,7 @@ def _start(config: FitConfig) -> VertiWMParams | None:
     if config.start is None:
         return None
     pretrained = config.start == Path("pretrained")
-    found, params = model.load(model.PRETRAINED if pretrained else config.start)
+    found, params = files.load(files.PRETRAINED if pretrained else config.start)
     if found.gates > config.model.gates or replace(found, gates=config.model.gates) != config.model:
         raise ConfigError(f"{config.start}: expected {config.model}, found {found}")
     return params

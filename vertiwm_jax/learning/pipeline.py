@@ -6,35 +6,35 @@ Every stage is a `stages.fit` in a folder of its own inside that of the run.
 import operator
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import jax
 import numpy as np
 
 from vertiwm_jax.config import settings
 from vertiwm_jax.dynamics import Params
-from vertiwm_jax.learning import autoencoders, dataset, normalisation, stages, windows
+from vertiwm_jax.learning import autoencoders, calibration, dataset, stages, windows
 from vertiwm_jax.learning.autoencoders import AutoencoderConfig, AutoencoderProblem, PatchData
 from vertiwm_jax.learning.dataset import Auxiliary, Drives, Split
 from vertiwm_jax.learning.fitting import FitConfig, Problem
 from vertiwm_jax.learning.losses import LossConfig
-from vertiwm_jax.learning.rollouts import OneStep, OpenLoop, WindowConfig, WindowData, WindowProblem
+from vertiwm_jax.learning.objectives import RolloutLoss, TeacherForcingLoss
+from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.learning.soils import SoilProblem
 from vertiwm_jax.learning.stages import Inputs
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import VehicleConfig, hmmwv
+from vertiwm_jax.models.config import ModelConfig, with_soil
 from vertiwm_jax.runs import Run
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model import model, nesam
-from vertiwm_jax.world_model.model import ModelConfig, VertiWM, VertiWMParams
-from vertiwm_jax.world_model.nesam import Nesam
-from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
+from vertiwm_jax.world_model.alone import Alone
+from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
 Kind = Literal["rigid", "deformable", "mixed"]
 KINDS: tuple[Kind, ...] = ("rigid", "deformable", "mixed")
@@ -51,10 +51,20 @@ class SpecialistConfig:
     """Collections for it and for its encoders."""
     autoencoders: FitConfig = FitConfig(updates=1000, weight_decay=0.0)
     """Of terrain patches; the encoders are frozen afterwards."""
-    single_steps: FitConfig = FitConfig(updates=400, warm_up=50, trainable=("network",))
-    """From recorded states, all of a window at once: a cheap beginning."""
-    rollouts: FitConfig = FitConfig(updates=10_000, trainable=("network",))
+    single_steps: FitConfig = FitConfig(updates=400, warm_up=50)
+    """From recorded states: a cheap beginning."""
+    rollouts: FitConfig = FitConfig()
     """Open loop, as it will be used."""
+
+    @classmethod
+    def of(cls, *trainable: str) -> Self:
+        """One of which these parameters are trained."""
+        base = cls()
+        return replace(
+            base,
+            single_steps=replace(base.single_steps, trainable=trainable),
+            rollouts=replace(base.rollouts, trainable=trainable),
+        )
 
 
 @dataclass(frozen=True)
@@ -64,7 +74,7 @@ class GateConfig:
     learns_from: tuple[Kind, ...] = ("mixed",)
     """Collections for it."""
     rollouts: FitConfig = FitConfig(updates=600, warm_up=50, trainable=("gate.network",))
-    """Open loop; `trainable` may name parts of `transformer` and `nesam` too."""
+    """Open loop; `trainable` may name parts of `transformer`, `nesam` and `encoders` too."""
 
 
 @settings
@@ -82,9 +92,9 @@ class PipelineConfig:
     """Of predictions."""
     patches: AutoencoderConfig = AutoencoderConfig()
     """Which patches of the ground, for autoencoders and soil predictor."""
-    transformer: SpecialistConfig = SpecialistConfig()
+    transformer: SpecialistConfig = SpecialistConfig.of("transformer.network", "encoders.0.reduce")
     """The specialist for rigid ground."""
-    nesam: SpecialistConfig = SpecialistConfig()
+    nesam: SpecialistConfig = SpecialistConfig.of("nesam.network")
     """The specialist for soil."""
     soil: FitConfig = FitConfig(updates=2000, weight_decay=0.0, trainable=("soil",))
     """The soil predictor."""
@@ -130,33 +140,26 @@ def fit(
     """
     driven = config.driven
     if start is not None and driven is not None:
-        simulator = replace(start.nesam.simulator, vehicle=jax.device_put(driven.vehicle))
-        start = replace(start, nesam=replace(start.nesam, simulator=simulator))
+        start = replace(start, vehicle=jax.device_put(driven.vehicle))
     pipeline = _Pipeline(config, tuple(folders), key, run, tuple(reuse), start)
-    digests: list[str] = []
-    built, parts = config.model, config.model.parts
+    model, parts = config.model, config.model.parts
     if start is None:
-        constants = normalisation.measure(pipeline.load(KINDS, "train")[0])
+        constants = calibration.normalization(pipeline.load(KINDS, "train")[0])
         physics = chrono_like(driven.vehicle if driven else hmmwv())
-        params = built.init_params(key, physics, constants)
+        params = model.init_params(key, physics, constants)
     else:
-        params = built.with_gates(start, key)
-    if "nesam" in parts:
-        second, digest = pipeline.specialist("nesam", built.nesam, params.nesam, config.nesam)
-        params = replace(params, nesam=second)
-        digests.append(digest)
-    if "transformer" in parts:
-        settings = config.transformer
-        specialist, untrained = built.transformer, params.transformer
-        first, digest = pipeline.specialist("transformer", specialist, untrained, settings)
-        params = replace(params, transformer=first)
-        digests.append(digest)
-    return pipeline.gate(built.build(), params, digests) if "gate" in parts else params
+        params = model.with_gates(start, key)
+    digests: list[str] = []
+    for name in ("nesam", "transformer"):
+        if name in parts:
+            params, digest = pipeline.specialist(name, params)
+            digests.append(digest)
+    return pipeline.gate(params, digests) if "gate" in parts else params
 
 
 @dataclass(frozen=True)
 class _Pipeline:
-    """What its stages share."""
+    """What its stages share; `loaded` are the drives that were read so far."""
 
     config: PipelineConfig
     folders: tuple[Path, ...]
@@ -164,72 +167,92 @@ class _Pipeline:
     run: Run
     reuse: tuple[Path, ...]
     start: VertiWMParams | None
+    loaded: dict[Any, tuple[Drives, TerrainMap]] = field(default_factory=dict)
 
     def specialist(
-        self,
-        name: str,
-        specialist: TransformerSpecialist | Nesam,
-        params: Any,
-        config: SpecialistConfig,
-    ) -> tuple[Any, str]:
-        """Its encoders, then for NeSAM what soils look like, then how it moves; and the digest."""
-        kinds, before = config.learns_from, self._begun
-        drives = self._drives(kinds)
-        if self.start is None and params.encoders is not None:
-            patches = self.config.patches
-            places = cache(lambda: PatchData.of(patches, *drives()))
-            seeing, schedule = name, config.autoencoders
-            if self.config.model.encoders == "shared":
-                seeing, schedule = "transformer", self.config.transformer.autoencoders
-            problem = AutoencoderProblem(patches)
-            pair = problem.init_params(self._key(seeing))
-            stage = f"{seeing}_autoencoders", problem, schedule, kinds
-            pair, digest = self._fit(*stage, pair, places)
-            before = (digest,)
-            params = replace(params, encoders=autoencoders.encoders(pair))
-            if isinstance(specialist, Nesam):
-                looks = {"encoders": params.encoders, "soil": params.soil}
-                problem = SoilProblem(patches)
-                stage = f"{name}_soil", problem, self.config.soil, kinds
-                looks, digest = self._fit(*stage, looks, places, before)
-                before = (*before, digest)
-                params = replace(params, soil=looks["soil"])
-        if self.start is None and isinstance(specialist, Nesam):
-            params = nesam.calibrate(specialist, params, *self._sample(drives))
+        self, name: Literal["transformer", "nesam"], params: VertiWMParams
+    ) -> tuple[VertiWMParams, str]:
+        """The parameters with one specialist fitted, and the digest of its last stage.
 
-        data = cache(lambda: WindowData.of(self.config.windows, *drives()))
-        deviation = tuple(params.normalisation.transition_deviation.tolist())
-        single, rollouts = OneStep(specialist, deviation), OpenLoop(specialist, self.config.loss)
+        First its encoders, then for NeSAM what soils look like, then how it moves.
+        """
+        model, config = self.config.model, getattr(self.config, name)
+        kinds, before = config.learns_from, self._begun
+        sees = name == "nesam" or model.terrain == "patches"
+        if self.start is None and sees:
+            params, before = self._encoders(name, params)
+        soil = params.encoders[-1].soil
+        if model.soil == "map":
+            params = with_soil(params, None)
+        if self.start is None and name == "nesam":
+            sample = self._sample(kinds)
+            params = calibration.nesam_constants(model.nesam, params, *sample)
+
+        # What is learned of `Encoders.reduce` is learned from latents.
+        alone = Alone(model.nesam) if name == "nesam" else Alone(model.transformer, sees)
+        own = params.nesam if name == "nesam" else params.transformer
+        assert own is not None
+        deviation = tuple(own.normalization.transition_deviation.tolist())
         parts = [
-            ("single_steps", single, config.single_steps),
-            ("rollouts", rollouts, config.rollouts),
+            ("single_steps", TeacherForcingLoss(alone, deviation), config.single_steps),
+            ("rollouts", RolloutLoss(alone, self.config.loss), config.rollouts),
         ]
+        data, digest = self._windows(kinds), ""
         for part, objective, schedule in parts if self.start is None else parts[1:]:
-            problem = WindowProblem(specialist, objective, self.config.windows)
+            problem = WindowProblem(alone, objective, self.config.windows)
             stage = f"{name}_{part}", problem, schedule, kinds
             params, digest = self._fit(*stage, params, data, before)
             before = (digest,)
-        return params, digest
+        return with_soil(params, soil), digest
 
-    def gate(
-        self, verti_wm: VertiWM, params: VertiWMParams, before: Sequence[str]
-    ) -> VertiWMParams:
+    def _encoders(
+        self, name: Literal["transformer", "nesam"], params: VertiWMParams
+    ) -> tuple[VertiWMParams, tuple[str, ...]]:
+        """The parameters with the encoders of a specialist, and the digests of these stages."""
+        config = getattr(self.config, name)
+        kinds, patches = config.learns_from, self.config.patches
+        places = cache(lambda: PatchData.of(patches, *self._drives(kinds)))
+        seeing, schedule = name, config.autoencoders
+        if self.config.model.encoders == "shared":
+            seeing, schedule = "transformer", self.config.transformer.autoencoders
+        problem = AutoencoderProblem(patches)
+        pair = problem.init_params(self._key(seeing))
+        stage = f"{seeing}_autoencoders", problem, schedule, kinds
+        pair, digest = self._fit(*stage, pair, places)
+        before, at = (digest,), 0 if name == "transformer" else len(params.encoders) - 1
+        found = replace(params.encoders[at], **autoencoders.encoders(pair))
+        if name == "nesam":
+            looks = {"semantic": found.semantic, "soil": found.soil}
+            stage = f"{name}_soil", SoilProblem(patches), self.config.soil, kinds
+            looks, digest = self._fit(*stage, looks, places, before)
+            before, found = (*before, digest), replace(found, soil=looks["soil"])
+        encoders = (*params.encoders[:at], found, *params.encoders[at + 1 :])
+        return replace(params, encoders=encoders), before
+
+    def gate(self, params: VertiWMParams, before: Sequence[str]) -> VertiWMParams:
         """The gates between two specialists, whose digests are given."""
-        config = self.config.gate
-        drives = self._drives(config.learns_from)
+        config, soil = self.config.gate, params.encoders[-1].soil
+        learned = config.rollouts.trainable
+        latents = not learned or any(name.startswith("encoders") for name in learned)
+        verti_wm = replace(self.config.model.verti_wm, latents=latents)
+        if self.config.model.soil == "map":
+            params = with_soil(params, None)
         if self.start is None:
-            params = model.calibrate(verti_wm, params, *self._sample(drives))
-        objective = OpenLoop(verti_wm, self.config.loss, operator.attrgetter("coefficients"))
+            sample = self._sample(config.learns_from)
+            params = calibration.gate_constants(verti_wm, params, *sample)
+        read = operator.attrgetter("coefficients")
+        objective = RolloutLoss(verti_wm, self.config.loss, read)
         problem = WindowProblem(verti_wm, objective, self.config.windows)
-        data = cache(lambda: WindowData.of(self.config.windows, *drives()))
+        data = self._windows(config.learns_from)
         schedule = problem, config.rollouts, config.learns_from
         fitted: list[VertiWMParams] = []
+        assert params.gate is not None
         for number in range(len(params.gate)):
             alone = replace(params, gate=params.gate.only(number))
             name = f"gate_{number}" if number else "gate"
             fitted.append(self._fit(name, *schedule, alone, data, before)[0])
-        first, *others = fitted
-        return replace(first, gate=first.gate.beside(*(each.gate for each in others)))
+        gates = [each.gate for each in fitted if each.gate is not None]
+        return with_soil(replace(fitted[0], gate=gates[0].beside(*gates[1:])), soil)
 
     def _fit(
         self,
@@ -263,14 +286,20 @@ class _Pipeline:
 
     def _drives(
         self, kinds: Sequence[Kind]
-    ) -> Callable[[], tuple[tuple[Drives, TerrainMap], tuple[Drives, TerrainMap]]]:
-        """Reads drives to learn from and to validate on, once."""
-        return cache(lambda: (self.load(kinds, "train"), self.load(kinds, "validation")))
+    ) -> tuple[tuple[Drives, TerrainMap], tuple[Drives, TerrainMap]]:
+        """Drives to learn from and to validate on."""
+        return self.load(kinds, "train"), self.load(kinds, "validation")
+
+    def _windows(self, kinds: Sequence[Kind]) -> Callable[[], WindowData]:
+        return cache(lambda: WindowData.of(self.config.windows, *self._drives(kinds)))
 
     def load(self, kinds: Sequence[Kind], split: Split) -> tuple[Drives, TerrainMap]:
         """Drives of these kinds in all folders, and of folders that are not divided into kinds."""
-        drives, terrain = dataset.load(self._folders(kinds), split)
-        return replace(drives, auxiliary=Auxiliary()), terrain
+        key = tuple(kinds), split
+        if key not in self.loaded:
+            drives, terrain = dataset.load(self._folders(kinds), split)
+            self.loaded[key] = replace(drives, auxiliary=Auxiliary()), terrain
+        return self.loaded[key]
 
     def _folders(self, kinds: Sequence[Kind]) -> list[Path]:
         chosen: list[Path] = []
@@ -284,9 +313,9 @@ class _Pipeline:
             )
         return chosen
 
-    def _sample(self, drives: Callable) -> tuple[TerrainMap, VehicleState, Command]:
+    def _sample(self, kinds: Sequence[Kind]) -> tuple[TerrainMap, VehicleState, Command]:
         """Some windows of the training drives as a measurement takes them, each on its world."""
-        recorded, terrain = drives()[0]
+        recorded, terrain = self.load(kinds, "train")
         config = self.config.windows
         index = windows.index(recorded, terrain, config.context, config.horizon, config.stride)
         rows = np.linspace(0, len(index.drive) - 1, SAMPLE).astype(int)

@@ -15,7 +15,6 @@ from vertiwm_jax.networks.soil_predictor import BOUNDS, SoilPredictor
 from vertiwm_jax.terrain import patches, query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
-from vertiwm_jax.world_model.perception import EncoderParams
 
 _ENCODER, _NETWORK = TerrainEncoder(3), SoilPredictor()
 
@@ -24,8 +23,8 @@ _ENCODER, _NETWORK = TerrainEncoder(3), SoilPredictor()
 class SoilProblem:
     """A `fitting.Problem`: the soil under the vehicle, from what the ground around it looks like.
 
-    The map's own soils supervise; places on rigid ground teach nothing. Parameters are `encoders`,
-    frozen, and `soil`.
+    The map's own soils supervise; places on rigid ground teach nothing. Parameters are
+    `semantic`, the frozen encoder of colors, and `soil`.
     """
 
     config: AutoencoderConfig
@@ -55,7 +54,7 @@ class SoilProblem:
         """`[6]` differences at one place, zero on rigid ground, and 1 on soil."""
         world = terrain.select(place.world)
         seen = patches.query(world, place.position, place.yaw)
-        encoder = cast(EncoderParams, jax.lax.stop_gradient(params["encoders"])).semantic
+        encoder = jax.lax.stop_gradient(params["semantic"])
         latent = cast(jax.Array, _ENCODER.apply(encoder, seen.rgb))
         predicted = cast(Soil, _NETWORK.apply(params["soil"], latent, jnp.float32(0)))
         kind = query.surface(world, place.position[:2]).semantic

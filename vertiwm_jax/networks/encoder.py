@@ -7,7 +7,6 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
 from vertiwm_jax.terrain.patches import CELL_PIXELS
 
@@ -31,85 +30,16 @@ class TerrainEncoder(nn.Module):
         shape = self.channels, CELL_PIXELS**2, LATENT_CHANNELS
         self.cell_kernel = self.param("cell_kernel", _analysis, shape)
         self.cell_bias = self.param("cell_bias", nn.initializers.zeros, (LATENT_CHANNELS,))
-        self.Conv_0 = _Halving(24)
+        self.Conv_0 = nn.Conv(24, (2, 2), strides=2, padding="VALID")
         self.Conv_1 = nn.Conv(_COARSE, (3, 3))
-        self.expand = _Linear(_COARSE, 4 * LATENT_CHANNELS)
+        self.expand = nn.Dense(4 * LATENT_CHANNELS, kernel_init=nn.initializers.zeros)
 
     def __call__(self, patch: jax.Array) -> jax.Array:
         """`[..., 128, 128, channels]` in about [-1, 1] to `[..., 16, 16, 18]`."""
         assert patch.shape[-1] == self.channels, patch.shape
-        projected = _cells(patch) @ self.cell_kernel.reshape(-1, LATENT_CHANNELS)
-        fours = _space_to_depth(projected, 2)
-        return in_rows(self.of_fours(fours.reshape(*fours.shape[:-1], 4, LATENT_CHANNELS)).latent)
-
-    def of_fours(self, projected: jax.Array) -> "Fours":
-        """The same of what `cell_kernel` makes of each cell, four by four: `[..., 8, 8, 4, 18]`."""
-        fours = projected.reshape(*projected.shape[:-2], -1) + jnp.tile(self.cell_bias, 4)
-        coarse = nn.silu(self.Conv_1(nn.silu(self.Conv_0(fours))))
-        return Fours(fours, coarse, self.expand.kernel, self.expand.bias)
-
-
-@struct.dataclass
-class Fours:
-    """A latent of four cells by four, whose sum need not be made to know what is linear in it.
-
-    fine: `[..., 8, 8, 4 * 18]` one addend; the other is `coarse` `[..., 8, 8, 23]` times `kernel`
-        `[23, 4 * 18]`, and `bias` `[4 * 18]`.
-    """
-
-    fine: jax.Array
-    coarse: jax.Array
-    kernel: jax.Array
-    bias: jax.Array
-
-    @property
-    def latent(self) -> jax.Array:
-        """`[..., 8, 8, 4, 18]`."""
-        return _of_each(self.fine + (self.coarse @ self.kernel + self.bias))
-
-    @property
-    def mean(self) -> jax.Array:
-        """`[..., 18]` over all cells."""
-        fine, coarse = (jnp.mean(x, axis=(-3, -2)) for x in (self.fine, self.coarse))
-        return jnp.mean(_of_each(fine + coarse @ self.kernel + self.bias), axis=-2)
-
-    def __matmul__(self, matrix: jax.Array) -> jax.Array:
-        """The latent times `[18, C]`, `[..., 8, 8, 4, C]`."""
-        kernel, bias = _of_each(self.kernel) @ matrix, _of_each(self.bias) @ matrix
-        added = self.coarse @ kernel.reshape(len(kernel), -1)
-        of_fine = _of_each(self.fine) @ matrix
-        return of_fine + added.reshape(of_fine.shape) + bias
-
-
-def _of_each(fours: jax.Array) -> jax.Array:
-    """`[..., 4 * 18]` to `[..., 4, 18]`."""
-    return fours.reshape(*fours.shape[:-1], 4, LATENT_CHANNELS)
-
-
-class _Linear(nn.Module):
-    """The weights of a `nn.Dense`, which begin as zeros, for who multiplies otherwise."""
-
-    inputs: int
-    outputs: int
-
-    def setup(self) -> None:
-        zeros = nn.initializers.zeros
-        self.kernel = self.param("kernel", zeros, (self.inputs, self.outputs))
-        self.bias = self.param("bias", zeros, (self.outputs,))
-
-
-class _Halving(nn.Module):
-    """A convolution of 2 x 2 cells with strides of 2, as a matmul of what lies side by side."""
-
-    features: int
-
-    @nn.compact
-    def __call__(self, fours: jax.Array) -> jax.Array:
-        """`[..., h, w, 4 C]`, row by row of the 2 x 2 cells, to `[..., h, w, features]`."""
-        shape = 2, 2, fours.shape[-1] // 4, self.features
-        kernel = self.param("kernel", nn.linear.default_kernel_init, shape)
-        bias = self.param("bias", nn.initializers.zeros, shape[-1:])
-        return fours @ kernel.reshape(-1, self.features) + bias
+        fine = _cells(patch) @ self.cell_kernel.reshape(-1, LATENT_CHANNELS) + self.cell_bias
+        coarse = nn.silu(self.Conv_1(nn.silu(self.Conv_0(fine))))
+        return fine + _depth_to_space(self.expand(coarse), 2)
 
 
 class TerrainDecoder(nn.Module):
@@ -199,20 +129,8 @@ def _cells(patch: jax.Array) -> jax.Array:
     return cells.transpose(order).reshape(*batch, h, w, -1)
 
 
-def in_rows(fours: jax.Array) -> jax.Array:
-    """`[..., h, w, 4, c]`, row by row of each 2 x 2 cells, to `[..., 2 h, 2 w, c]`."""
-    return _depth_to_space(fours.reshape(*fours.shape[:-2], -1), 2)
-
-
 def _depth_to_space(x: jax.Array, block: int) -> jax.Array:
     """`[..., h, w, block * block * c]` to `[..., h * block, w * block, c]`, a block from each."""
     *batch, h, w, c = x.shape
     x = x.reshape(*batch, h, w, block, block, c // block**2)
     return jnp.swapaxes(x, -4, -3).reshape(*batch, h * block, w * block, -1)
-
-
-def _space_to_depth(x: jax.Array, block: int) -> jax.Array:
-    """`[..., h, w, c]` to `[..., h / block, w / block, c block**2]`, the inverse."""
-    *batch, h, w, c = x.shape
-    x = x.reshape(*batch, h // block, block, w // block, block, c)
-    return jnp.swapaxes(x, -4, -3).reshape(*batch, h // block, w // block, -1)

@@ -6,6 +6,8 @@ only how far apart two tokens are, wherever the cache keeps them.
 """
 
 import math
+from functools import partial
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -13,10 +15,21 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax.networks.layers import Dense
-
 _PERIODS_A_WINDOW = 16
 _MASKED = -1e30  # finite: the softmax of a masked score is 0 and its gradient is no NaN
+
+
+def _as_kernel(*operands: Any, **_: Any) -> list[Any]:
+    inputs, kernel, bias = operands
+    return [inputs.astype(kernel.dtype), kernel, bias]
+
+
+Dense = partial(
+    nn.Dense,
+    promote_dtype=_as_kernel,
+    dot_general=partial(jax.lax.dot_general, preferred_element_type=jnp.float32),
+)
+"""`nn.Dense` whose operands are rounded as its kernel is, to bfloat16 perhaps; sums are float32."""
 
 
 @struct.dataclass

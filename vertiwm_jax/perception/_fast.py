@@ -19,7 +19,7 @@ import numpy as np
 from flax import struct
 from jax.custom_batching import custom_vmap
 
-from vertiwm_jax.networks.encoder import LATENT_CHANNELS, in_rows
+from vertiwm_jax.networks.encoder import LATENT_CHANNELS
 from vertiwm_jax.perception.features import Encoders, TerrainFeatures, features
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import grid, patches
@@ -139,7 +139,7 @@ def _look(
     of_each = zip(*(jnp.split(x, len(encoders), axis=-1) for x in projected), strict=True)
     seen = []
     for i, (pair, (elevation, semantic)) in enumerate(zip(encoders, of_each, strict=True)):
-        read = partial(features, pair, keep=latents and i == 0, in_rows=in_rows)
+        read = partial(features, pair, keep=latents and i == 0, in_rows=_in_rows)
         both = _blocks(pair.elevation, elevation), _blocks(pair.semantic, semantic)
         seen.append(jax.vmap(read)(*both))
     return tuple(seen)
@@ -159,6 +159,12 @@ def _blocks(encoder: Any, projected: jax.Array) -> jax.Array:
     coarse = nn.silu(cast(jax.Array, around.apply({"params": weights["Conv_1"]}, coarse)))
     both = fours + (coarse @ expand["kernel"] + expand["bias"])
     return both.reshape(*both.shape[:-1], 4, LATENT_CHANNELS)
+
+
+def _in_rows(fours: jax.Array) -> jax.Array:
+    """`[8, 8, 4, c]`, row by row of each 2 x 2 cells, to `[16, 16, c]`."""
+    squares = fours.reshape(_SIDE, _SIDE, 2, 2, -1)
+    return jnp.swapaxes(squares, 1, 2).reshape(2 * _SIDE, 2 * _SIDE, -1)
 
 
 def _projections(

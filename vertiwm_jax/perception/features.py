@@ -15,6 +15,7 @@ from vertiwm_jax.terrain.soil import Soil
 
 EMBEDDING_SHAPE = (16, 16, 2 * LATENT_CHANNELS)
 """Of latents: rows, the first farthest ahead; columns, the first farthest left; and channels."""
+CELLS = EMBEDDING_SHAPE[0] * EMBEDDING_SHAPE[1]
 _ELEVATION, _SEMANTIC, _SOIL = TerrainEncoder(1), TerrainEncoder(3), SoilPredictor()
 
 

@@ -30,19 +30,37 @@ def perceive(
         terrain: the map, its world selected.
         state: leaves `[3]`.
         latents: whether those of the first pair are kept, for a policy to see them, or for
-            `Encoders.reduce` of the first pair to be learned. Without them a gradient of it raises.
+            `Encoders.reduce` of the first pair to be learned; `reduced` then gives the features
+            that are left out. Without them a gradient of `Encoders.reduce` raises.
 
     Returns:
         Features of each pair.
     """
-    if not latents:
-        encoders = tuple(_without_gradient(pair) for pair in encoders)
-    seen = jax.lax.platform_dependent(
-        *jax.lax.stop_gradient((encoders, terrain, state)),
+    first, *others = encoders
+    looking = replace(first, reduce=None) if latents else _without_gradient(first)
+    return jax.lax.platform_dependent(
+        *jax.lax.stop_gradient(((looking, *map(_without_gradient, others)), terrain, state)),
         cpu=partial(_fast.look, latents=latents),
         default=partial(_plain, latents=latents),
     )
-    return _learnable(encoders[0], seen) if latents else seen
+
+
+def reduced(
+    encoders: tuple[Encoders, ...], features: tuple[TerrainFeatures, ...]
+) -> tuple[TerrainFeatures, ...]:
+    """Features of `perceive`, with what `Encoders.reduce` makes of latents that were kept."""
+    first, *others = features
+    if first.latents is None or encoders[0].reduce is None:
+        return features
+    latents = jnp.split(first.latents, 2, axis=-1)
+    return (replace(first, reduced=reduce(encoders[0].reduce, *latents).ravel()), *others)
+
+
+def embed(encoders: Encoders, terrain: TerrainMap, state: VehicleState) -> jax.Array:
+    """`[16, 16, 36]` latents of the ground at one vehicle's pose, as policies see them."""
+    (features,) = perceive((encoders,), terrain, state, latents=True)
+    assert features.latents is not None
+    return features.latents
 
 
 def _plain(
@@ -54,15 +72,6 @@ def _plain(
         features(pair, *encode(pair, seen), keep=latents and i == 0)
         for i, pair in enumerate(encoders)
     )
-
-
-def _learnable(first: Encoders, seen: tuple[TerrainFeatures, ...]) -> tuple[TerrainFeatures, ...]:
-    """The same with `reduced` computed once more from latents, so that a gradient reaches it."""
-    if first.reduce is None:
-        return seen
-    assert seen[0].latents is not None
-    latents = jnp.split(seen[0].latents, 2, axis=-1)
-    return (replace(seen[0], reduced=reduce(first.reduce, *latents).ravel()), *seen[1:])
 
 
 def _without_gradient(pair: Encoders) -> Encoders:

@@ -24,6 +24,8 @@ from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
+from vertiwm_jax.models.registry import Imagined, ModelName, load_encoders, load_model
+from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.rl import loop, policy
 from vertiwm_jax.rl.learned import MeanAction, TwinValue, Value
 from vertiwm_jax.rl.loop import LoopConfig
@@ -37,15 +39,7 @@ from vertiwm_jax.rl.td3 import TD3, TD3Config
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.training import Algorithm, keep_compiled
-from vertiwm_jax.world_model.choice import (
-    Imagined,
-    ModelName,
-    Operands,
-    choose,
-    lean,
-    rounded,
-    sighted,
-)
+from vertiwm_jax.world_model.network import ComputeDtype
 
 Rows = dict[str, Policy | Agent]
 """Policies by their names in tables."""
@@ -85,7 +79,7 @@ class TaskConfig:
     """What moves the vehicle while learning; tests after it are in the built-in simulator."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
-    operands: Operands | Literal["auto"] = "auto"
+    operands: ComputeDtype | Literal["auto"] = "auto"
     """What learned models multiply; bfloat16 is faster on CPUs with AVX512_BF16, slower on others,
     and leaves errors of prediction what they are to 1 %. A training that begins with auto tries
     which it is, and keeps to it."""
@@ -96,7 +90,7 @@ class TaskConfig:
         vehicle.load(self.vehicle)  # That it cannot be read is to be said now.
 
     @property
-    def multiplied(self) -> Operands:
+    def multiplied(self) -> ComputeDtype:
         """`operands`, or which of them are faster here."""
         if self.operands == "auto":
             return "bfloat16" if machine.multiplies_bfloat16() else "float32"
@@ -286,19 +280,29 @@ def environment(
     """Tasks inside one of the models."""
     moves, params = dynamics(config, model)
     env = NavigationEnv(moves, config.navigation, variation)
-    return Task(env, env.make_params(params, terrain, pool, config.driven.vehicle))
+    made = env.make_params(params, terrain, pool, config.driven.vehicle, encoders(config))
+    return Task(env, made)
 
 
-def dynamics(config: TaskConfig, model: Imagined) -> tuple[Dynamics, Params]:
+def dynamics(
+    config: TaskConfig, model: Imagined, exact_gradient: bool = False
+) -> tuple[Dynamics, Params]:
     """One of the models, and its parameters."""
     if model == "builtin":
-        moves, params = config.simulator, chrono_like(config.driven.vehicle)
-    else:
-        moves, params = choose(model, config.weights, vehicle=config.driven.vehicle)
-        params = rounded(params, config.multiplied)
-    if config.navigation.embeddings:
-        return sighted(model, moves, params, config.weights)
-    return lean(moves), params
+        return config.simulator, chrono_like(config.driven.vehicle)
+    return load_model(
+        model,
+        config.weights,
+        vehicle=config.driven.vehicle,
+        embeddings=config.navigation.embeddings,
+        compute_dtype=config.multiplied,
+        exact_gradient=exact_gradient,
+    )
+
+
+def encoders(config: TaskConfig) -> Encoders | None:
+    """By which policies see the ground, if they see it."""
+    return load_encoders(config.weights) if config.navigation.embeddings else None
 
 
 def outcomes(info: dict[str, jax.Array]) -> dict[str, jax.Array]:
@@ -338,7 +342,8 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
     machine.forget_programs()
     moves, weights = dynamics(config, config.model)
     env = NavigationEnv(moves, config.navigation, config.variation)
-    shapes = env.shapes(weights, terrain, pool, config.driven.vehicle)
+    driven = config.driven.vehicle, encoders(config)
+    shapes = env.shapes(weights, terrain, pool, *driven)
     algorithm, schedule, seeds = config.algorithm(env), config.schedule, config.loop.seeds
     steps = schedule.collected * config.action_repeat
     restored = loop.restore(algorithm, shapes, config.resume, seeds) if config.resume else None
@@ -346,7 +351,7 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
         # Now, while there are no vehicles yet that fill the memory.
         loop.prepare(algorithm, shapes, seeds, schedule.shareable)
     _log.info("placing vehicles for %s tasks ...", f"{len(pool.world):,}")
-    params = env.make_params(weights, terrain, pool, config.driven.vehicle)
+    params = env.make_params(weights, terrain, pool, *driven)
     machine.forget_programs()
     with Run.begin(config, config.name, restored[0] if restored else 0, config.wandb) as begun:
         _log.info("run folder %s", begun.folder)

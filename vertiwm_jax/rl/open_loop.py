@@ -7,9 +7,9 @@ from flax import struct
 from vertiwm_jax.config import Count, Discount, NotNegative, Positive, settings
 from vertiwm_jax.env.agent import Now
 from vertiwm_jax.env.task import TaskParams, TaskState
+from vertiwm_jax.models.registry import Imagined
 from vertiwm_jax.rl.imagining import Future, Imagining, Plan
 from vertiwm_jax.state import STEP_SECONDS
-from vertiwm_jax.world_model.choice import Imagined
 
 
 @settings

@@ -9,9 +9,9 @@ from flax import struct
 from vertiwm_jax.config import Count, NotNegative, settings
 from vertiwm_jax.env.action_repeat import Controller
 from vertiwm_jax.env.agent import Now
+from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl.imagining import Future, Imagining, Plan, around
 from vertiwm_jax.rl.learned import MeanAction, TwinValue, Value
-from vertiwm_jax.world_model.choice import ModelName
 
 
 @settings

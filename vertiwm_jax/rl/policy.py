@@ -15,16 +15,16 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError, Count, Share
-from vertiwm_jax.dynamics import EMBEDDING_SHAPE
 from vertiwm_jax.env import observation
 from vertiwm_jax.env.action_repeat import Controller
 from vertiwm_jax.env.controllers import baselines
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
+from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.networks.policy import ActionCritic, Actor, Critic, Senses, SquashedActor
+from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.rl.learned import Corrected, MeanAction, TwinValue, Value
 from vertiwm_jax.rl.normalise import RunningStatistics
-from vertiwm_jax.world_model.choice import ModelName
 
 FOLDER = "policy"
 """Name of the folder in that of a run."""

@@ -15,11 +15,11 @@ from vertiwm_jax.env.reward import ending_reward
 from vertiwm_jax.env.task import TaskState
 from vertiwm_jax.env.termination import TerminationReason, edge_distance
 from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.models.registry import Imagined
 from vertiwm_jax.rl.imagining import Plan, around
 from vertiwm_jax.rl.open_loop import OpenLoop, OpenLoopConfig
 from vertiwm_jax.terrain import obstacles
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.choice import Imagined
 
 
 @settings
@@ -57,7 +57,7 @@ class Shooting(OpenLoop):
     shooting). The return is a smooth one: of two plans that miss a rock, the one that keeps farther
     from it returns more.
 
-    env: of a model whose gradients are exact, see `world_model.choice.exact`.
+    env: of a model whose gradients are exact, see `exact_gradient` of `load_model`.
     """
 
     config: ShootingConfig = struct.field(pytree_node=False, default=ShootingConfig())

@@ -16,13 +16,13 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.learning import schema
 from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.simulators import excitation
 from vertiwm_jax.simulators.driving import Drive, Ending, Pilot, drive
 from vertiwm_jax.simulators.excitation import MARGIN, within
 from vertiwm_jax.simulators.following import AgentPilot, Followed
 from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.perception import Eyes, Sighted, SightedParams
 
 LEAST_UPRIGHT = 0.3
 """Cosine of the tilt below which a vehicle has rolled over."""
@@ -48,7 +48,7 @@ def record(
 def to_goals(
     policy: Policy,
     config: NavigationConfig,
-    eyes: Eyes | None,
+    encoders: Encoders | None,
     vehicle: Vehicle,
     terrain: TerrainMap,
     start: Sequence[float],
@@ -59,19 +59,18 @@ def to_goals(
     Args:
         policy: what drives.
         config: the task that it has learned.
-        eyes: what it sees embeddings of the ground by; None if it sees none.
+        encoders: what it sees embeddings of the ground by; None if it sees none.
         vehicle: what is driven.
         terrain: where.
         start: x, y, m, and yaw, rad.
         rng: draws the goals.
     """
-    moves, params = Followed(), jnp.zeros(12)
-    env = NavigationEnv(Sighted(moves) if eyes else moves, replace(config, settle_steps=0))
+    env = NavigationEnv(Followed(), replace(config, settle_steps=0))
     next_goal = partial(excitation.next_goal, rng, terrain)
     place = jnp.asarray([start], jnp.float32)
     goal = jnp.asarray(next_goal(np.asarray(place[0, :2]))[None, :2])
     one = Tasks(jnp.reshape(terrain.world, 1), place[:, :2], place[:, 2], goal)
-    task = env.make_params(SightedParams(params, eyes) if eyes else params, terrain, one, vehicle)
+    task = env.make_params(jnp.zeros(12), terrain, one, vehicle, encoders)
     at_start = jax.tree.map(lambda x: x[0], task.starts)
     # No learned policy is random.
     return AgentPilot(env, task, Reactive(policy), at_start, jax.random.key(0), next_goal)

@@ -17,7 +17,6 @@ from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.perception import Sighted, SightedParams
 
 
 @dataclass(frozen=True)
@@ -39,10 +38,7 @@ class Followed:
 
 
 def followed(env: NavigationEnv) -> NavigationEnv:
-    """The same task, with the vehicle moved from outside; it sees by the same encoders."""
-    dynamics = env.dynamics
-    if isinstance(dynamics, Sighted):
-        return replace(env, dynamics=replace(dynamics, dynamics=Followed()))
+    """The same task, with the vehicle moved from outside."""
     return replace(env, dynamics=Followed())
 
 
@@ -141,9 +137,6 @@ def move(
 
 def moved(task: TaskParams, state: jax.Array) -> TaskParams:
     """Parameters by which `Followed` moves the vehicle to a state `[12]`."""
-    dynamics = task.dynamics
-    if isinstance(dynamics, SightedParams):
-        return replace(task, dynamics=replace(dynamics, dynamics=state))
     return replace(task, dynamics=state)
 
 

@@ -1,1 +1,1 @@
-"""Learned models of a vehicle: the specialists of Verti-WM, their fusion, and what they see."""
+"""The paper's method: two specialists and the gate that fuses them (Eqs. 1-8)."""

@@ -11,7 +11,7 @@ from vertiwm_jax.state import STEP_SECONDS, VehicleState
 
 
 def increment(before: VehicleState, after: VehicleState) -> jax.Array:
-    """`[..., 6]` xi of Eq. 4, the pose after in the body frame before: tangent order, m and rad.
+    """`[..., 6]` xi of Eq. 3, the pose after in the body frame before: tangent order, m and rad.
 
     Positions are subtracted before they are turned: far from the origin of the map, the inverse
     of a pose in float32 would cost more than the micrometres that matter near identity.
@@ -50,7 +50,7 @@ def twist(state: VehicleState) -> jax.Array:
 
 
 def moved(state: VehicleState, increment: jax.Array, twist: jax.Array) -> VehicleState:
-    """The state T Exp(xi) with nu: increment `[..., 6]` m and rad, twist `[..., 6]`."""
+    """The state T Exp(xi) with nu (Eq. 8): increment `[..., 6]` m and rad, twist `[..., 6]`."""
     position, rpy = geometry.moved(state.position, state.rpy, increment)
     return replace(
         state,

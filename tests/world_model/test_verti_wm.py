@@ -1,13 +1,11 @@
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import struct
 from world_model.examples import (
     CONSTANTS,
     TINY,
@@ -23,63 +21,54 @@ from vertiwm_jax.dynamics import disagreement, rollout
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.world_model import motion
-from vertiwm_jax.world_model.model import ModelConfig, VertiWM
-from vertiwm_jax.world_model.perception import EncoderParams, Exteroception, Perception, View
-from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
+from vertiwm_jax.models.config import ModelConfig
+from vertiwm_jax.perception.features import init_pair, init_reduce
+from vertiwm_jax.perception.perceive import perceive
+from vertiwm_jax.world_model import motion, verti_wm
+from vertiwm_jax.world_model.alone import Alone
+from vertiwm_jax.world_model.fusion import GateParams
+from vertiwm_jax.world_model.transformer import Transformer
+from vertiwm_jax.world_model.verti_wm import VertiWM, VertiWMParams
 
 TERRAIN = rough()
 
 
-@struct.dataclass
-class SeeingParams:
-    physics: Any
-    encoders: EncoderParams
-
-
-@struct.dataclass
-class SeeingHistory:
-    physics: Any
-    perception: Perception | None
-
-
 @dataclass(frozen=True)
-class SeeingBicycle:
-    """Physics that looks at the ground, as little as a specialist can be."""
+class Bicycle:
+    """Physics without forces in the place of NeSAM."""
 
-    exteroception: Exteroception = Exteroception()
-    bicycle: KinematicBicycle = KinematicBicycle()
+    def init(self, params, vehicle, terrain, state):
+        return KinematicBicycle().init(params, terrain, state)
 
-    def init(self, params, terrain, state):
-        begun = self.begin(params, terrain, state)
-        return replace(begun, perception=self.look(params, terrain, state))
-
-    def begin(self, params, terrain, state):
-        return SeeingHistory(self.bicycle.init(params.physics, terrain, state), None)
-
-    def step(self, params, terrain, history, state, command):
-        state, history = self.propose(params, terrain, history, state, command)
-        return state, replace(history, perception=self.look(params, terrain, state))
-
-    def look(self, params, terrain, state):
-        return self.exteroception.look((self.view(params),), terrain, state)[0]
-
-    def view(self, params):
-        return View(params.encoders)
-
-    def propose(self, params, terrain, history, state, command):
-        arguments = (params.physics, terrain, history.physics, state, command)
-        state, physics = self.bicycle.step(*arguments)
-        return state, replace(history, physics=physics)
+    def propose(self, params, vehicle, terrain, features, history, state, command):
+        return KinematicBicycle().step(params, terrain, history, state, command)
 
 
-TRANSFORMER, PHYSICS = TransformerSpecialist(replace(TINY, layers=1)), SeeingBicycle()
-MODEL = VertiWM(TRANSFORMER, PHYSICS)
-KEYS = jax.random.split(jax.random.key(0), 3)
-OF_TRANSFORMER = moved(jax.jit(TRANSFORMER.init_params)(KEYS[0], CONSTANTS))
-OF_PHYSICS = SeeingParams(bicycle_of(hmmwv()), jax.jit(Exteroception().init_params)(KEYS[1]))
-UNTRAINED = jax.jit(MODEL.init_params)(KEYS[2], OF_TRANSFORMER, OF_PHYSICS)
+TRANSFORMER = Transformer(replace(TINY, layers=1))
+MODEL = VertiWM(TRANSFORMER, Bicycle())
+SPECIALISTS = {"transformer": Alone(TRANSFORMER), "nesam": KinematicBicycle()}
+KEYS = jax.random.split(jax.random.key(0), 4)
+
+
+def seeing(key, **more):
+    """Encoders none of whose weights is zero."""
+    encoders = replace(init_pair(key), **more)
+    scale = jax.random.uniform(key, (), minval=0.02, maxval=0.06)
+    return jax.tree.map(
+        lambda x: x + scale * jnp.cos(jnp.arange(x.size)).reshape(x.shape), encoders
+    )
+
+
+UNTRAINED = VertiWMParams(
+    encoders=(seeing(KEYS[0], reduce=init_reduce(KEYS[1], TINY.channels)), seeing(KEYS[3])),
+    vehicle=hmmwv(),
+    transformer=moved(jax.jit(TRANSFORMER.init_params)(KEYS[0], CONSTANTS)),
+    nesam=bicycle_of(hmmwv()),
+    gate=GateParams.untrained(KEYS[2], "mean", 1),
+)
 PARAMS = replace(UNTRAINED, gate=moved(UNTRAINED.gate))
+PARTS = {"transformer": PARAMS, "nesam": PARAMS.nesam}
+"""Parameters of each specialist alone."""
 
 
 STATE, CONTROL = driving(1), commands(12)
@@ -126,8 +115,7 @@ def with_outputs(outputs):
 
 @pytest.mark.parametrize(("terrain", "parameters"), [("mean", 33_764), ("both", 37_220)])
 def test_gate_has_the_parameters_of_the_paper(terrain, parameters):
-    model = VertiWM(TRANSFORMER, PHYSICS, gate_terrain=terrain)
-    gate = jax.eval_shape(model.init_params, KEYS[2], OF_TRANSFORMER, OF_PHYSICS).gate
+    gate = jax.eval_shape(lambda key: GateParams.untrained(key, terrain, 1), KEYS[2])
     assert count(gate.network) == parameters
 
 
@@ -136,16 +124,15 @@ def test_all_of_one_specialist_is_that_specialist(alpha, specialist):
     """A whole rollout, so each has its history and sees the fused state as if it were alone."""
     params = with_outputs(np.full(4, np.arctanh((alpha - 0.5) / 1.5)))
     together, _ = fused(params, TERRAIN, STATE, CONTROL)
-    model, params = getattr(MODEL, specialist), getattr(params, specialist)
-    expected = alone(params, TERRAIN, STATE, CONTROL, model=model)
+    model = SPECIALISTS[specialist]
+    expected = alone(PARTS[specialist], TERRAIN, STATE, CONTROL, model=model)
     np.testing.assert_allclose(together.vector, expected.vector, atol=2e-4)
 
 
 def test_an_untrained_gate_takes_the_middle_of_both():
     runs = (
         fused(UNTRAINED, TERRAIN, STATE, CONTROL)[0],
-        alone(OF_TRANSFORMER, TERRAIN, STATE, CONTROL, model=TRANSFORMER),
-        alone(OF_PHYSICS, TERRAIN, STATE, CONTROL, model=PHYSICS),
+        *(alone(PARTS[x], TERRAIN, STATE, CONTROL, model=SPECIALISTS[x]) for x in PARTS),
     )
     together, one, other = (jax.tree.map(lambda x: x[0], run) for run in runs)
     for of in (lambda state: motion.increment(STATE, state), motion.twist):
@@ -153,38 +140,40 @@ def test_an_untrained_gate_takes_the_middle_of_both():
 
 
 def test_both_see_the_fused_state_through_their_own_encoders():
-    history = init(PARAMS, TERRAIN, STATE)
-    after, history = step(PARAMS, TERRAIN, history, STATE, COMMAND)
-    for name in ("transformer", "nesam"):
-        specialist, params = getattr(MODEL, name), getattr(PARAMS, name)
-        expected = init(params, TERRAIN, after, model=specialist).perception
-        seen = getattr(history, name).perception
+    after, history = step(PARAMS, TERRAIN, init(PARAMS, TERRAIN, STATE), STATE, COMMAND)
+    for seen, pair in zip(history.features, PARAMS.encoders, strict=True):
+        (expected,) = jax.jit(perceive)((pair,), TERRAIN, after)
         # A pixel on a border between classes may fall to its other side.
-        np.testing.assert_allclose(seen.elevation, expected.elevation, atol=1e-4)
-        assert np.mean(np.abs(seen.semantic - expected.semantic) > 1e-4) < 1e-2
-    assert history.perception is history.transformer.perception
+        np.testing.assert_allclose(seen.average, expected.average, atol=1e-3)
+    assert np.abs(history.features[0].average - history.features[1].average).max() > 0.01
 
 
-def test_shared_encoders_are_those_of_the_transformer():
-    """With the same weights for both it is the same model, and NeSAM's own are not asked."""
-    other = jax.tree.map(lambda x: 1.2 * x, PARAMS.nesam.encoders)  # untrained, all are alike
-    apart, alike = (
-        replace(PARAMS, nesam=replace(PARAMS.nesam, encoders=encoders))
-        for encoders in (other, PARAMS.transformer.encoders)
-    )
+def test_one_pair_of_encoders_is_that_of_both():
+    """With the same weights for both it is the same model."""
+    first, _ = PARAMS.encoders
+    alike, shared = replace(PARAMS, encoders=(first, first)), replace(PARAMS, encoders=(first,))
     expected, expected_alphas = fused(alike, TERRAIN, STATE, CONTROL)
-    shared = replace(MODEL, encoders="shared")
-    states, alphas = fused(apart, TERRAIN, STATE, CONTROL, model=shared)
+    states, alphas = fused(shared, TERRAIN, STATE, CONTROL)
     # In the first six steps: after them, roundings have grown.
     np.testing.assert_allclose(alphas[:6], expected_alphas[:6], atol=1e-5)
-    first, expected = (jax.tree.map(lambda x: x[:6], each) for each in (states, expected))
-    chex.assert_trees_all_close(first, expected, atol=1e-4)
-    assert np.max(np.abs(alphas - fused(apart, TERRAIN, STATE, CONTROL)[1])) > 1e-3
+    begun, expected = (jax.tree.map(lambda x: x[:6], each) for each in (states, expected))
+    chex.assert_trees_all_close(begun, expected, atol=1e-4)
+    assert np.max(np.abs(alphas - fused(PARAMS, TERRAIN, STATE, CONTROL)[1])) > 1e-3
 
 
-def test_shared_patches_are_queried_once(monkeypatch):
-    looks, plain = [], Exteroception.look
-    monkeypatch.setattr(Exteroception, "look", lambda *a: looks.append(a[0]) or plain(*a))
+def test_latents_are_kept_for_policies_and_change_nothing():
+    model = replace(MODEL, latents=True)
+    expected, expected_alphas = fused(PARAMS, TERRAIN, STATE, CONTROL)
+    states, alphas = fused(PARAMS, TERRAIN, STATE, CONTROL, model=model)
+    np.testing.assert_allclose(alphas, expected_alphas, atol=1e-4)
+    chex.assert_trees_all_close(states, expected, atol=1e-3)
+    first, second = init(PARAMS, TERRAIN, STATE, model=model).features
+    assert first.latents.shape == (16, 16, 36) and second.latents is None
+
+
+def test_all_encoders_look_at_once(monkeypatch):
+    looks = []
+    monkeypatch.setattr(verti_wm, "perceive", lambda *args: looks.append(args) or perceive(*args))
     history = jax.eval_shape(MODEL.init, PARAMS, TERRAIN, STATE)
     looks.clear()
     jax.eval_shape(MODEL.step, PARAMS, TERRAIN, history, STATE, COMMAND)
@@ -203,10 +192,8 @@ def test_coefficients_are_in_the_history_and_vary_along_a_drive():
 def test_disagreement_is_how_far_apart_the_proposals_are():
     history = init(PARAMS, TERRAIN, STATE)
     assert disagreement(history) == 0
-    ends, first = [], jax.tree.map(lambda x: x[:1], CONTROL)
-    for name in ("transformer", "nesam"):
-        specialist, params = getattr(MODEL, name), getattr(PARAMS, name)
-        ends.append(alone(params, TERRAIN, STATE, first, specialist))
+    first = jax.tree.map(lambda x: x[:1], CONTROL)
+    ends = [alone(PARTS[name], TERRAIN, STATE, first, SPECIALISTS[name]) for name in PARTS]
     _, history = step(PARAMS, TERRAIN, history, STATE, COMMAND)
     apart = np.linalg.norm(ends[0].position[0] - ends[1].position[0])
     assert apart > 1e-3
@@ -303,21 +290,24 @@ def test_a_batch_is_a_loop_and_one_trace_serves_all_drives():
 def test_proposals_reach_the_fused_state_but_not_the_gate_with_gradients():
     history = init(PARAMS, TERRAIN, STATE)
 
+    learned = PARAMS.transformer, PARAMS.gate
+
     @jax.jit
     def along(direction):
-        def after(params):
+        def after(learned):
+            params = replace(PARAMS, transformer=learned[0], gate=learned[1])
             state, history_ = MODEL.step(params, TERRAIN, history, STATE, COMMAND)
             return state.vector, history_.coefficients
 
-        return jax.jvp(after, (PARAMS,), (direction,))[1]
+        return jax.jvp(after, (learned,), (direction,))[1]
 
-    still = jax.tree.map(jnp.zeros_like, PARAMS)
+    transformer, gate = jax.tree.map(jnp.zeros_like, learned)
     network = jax.tree.map(jnp.ones_like, PARAMS.transformer.network)
-    by_proposal = replace(still, transformer=replace(still.transformer, network=network))
+    by_proposal = replace(transformer, network=network), gate
     network = jax.tree.map(jnp.ones_like, PARAMS.gate.network)
-    by_gate = replace(still, gate=replace(still.gate, network=network))
+    by_gate = transformer, replace(gate, network=network)
     ones = jnp.ones_like(PARAMS.gate.mean)
-    by_constants = replace(still, gate=replace(still.gate, mean=ones, scale=ones))
+    by_constants = transformer, replace(gate, mean=ones, scale=ones)
     moves = [[bool(np.any(x)) for x in along(d)] for d in (by_proposal, by_gate, by_constants)]
     assert moves == [[True, False], [True, True], [False, False]]
 

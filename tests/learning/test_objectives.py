@@ -10,16 +10,11 @@ import pytest
 from vertiwm_jax import runs
 from vertiwm_jax.evaluation import prediction
 from vertiwm_jax.evaluation.prediction import TestWindows
-from vertiwm_jax.learning import dataset, fitting, rollouts, windows
+from vertiwm_jax.learning import dataset, fitting, objectives, windows
 from vertiwm_jax.learning.fitting import FitConfig
 from vertiwm_jax.learning.losses import LossConfig, step_loss, trajectory_loss
-from vertiwm_jax.learning.rollouts import (
-    OneStep,
-    OpenLoop,
-    WindowConfig,
-    WindowData,
-    WindowProblem,
-)
+from vertiwm_jax.learning.objectives import RolloutLoss, TeacherForcingLoss
+from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.runs import Run
@@ -52,10 +47,6 @@ class Drift:
     def step(self, params, terrain, history, state, command):
         return replace(state, position=state.position + params), history + 1
 
-    def follow(self, params, terrain, states, commands):
-        assert states.position.shape == (*commands.speed.shape, 3)
-        return replace(states, position=states.position + params)
-
 
 def window(seed=0, context=2, horizon=4):
     rng = np.random.default_rng(seed)
@@ -71,7 +62,7 @@ def window(seed=0, context=2, horizon=4):
 
 def test_open_loop_starts_where_the_context_ends():
     one, step = window(), jnp.array([0.1, -0.2, 0.3])
-    predicted, ages = rollouts.open_loop(Drift(), step, None, one, lambda history: history)
+    predicted, ages = objectives.open_loop(Drift(), step, None, one, lambda history: history)
     expected = one.state[2, :3] + step * np.arange(1, 5)[:, None]
     np.testing.assert_allclose(predicted.position, expected, rtol=1e-5)
     np.testing.assert_array_equal(ages, [3, 4, 5, 6])
@@ -81,31 +72,31 @@ def test_open_loop_is_a_step_after_the_other(data):
     one = jax.tree.map(lambda x: x[7], data.validation)
     terrain, params = data.validation_terrain.select(one.world), bicycle_of(hmmwv())
     state = VehicleState.from_vector(one.state[CONFIG.context])
-    found, _ = rollouts.open_loop(BICYCLE, params, terrain, one, lambda _: None)
+    found, _ = objectives.open_loop(BICYCLE, params, terrain, one, lambda _: None)
     step = jax.jit(BICYCLE.step)
     for k, control in enumerate(one.control[CONFIG.context :]):
         state, _ = step(params, terrain, (), state, Command.from_vector(control))
         np.testing.assert_allclose(found.vector[k], state.vector, atol=1e-4)
 
 
-def test_the_open_loop_objective_is_the_trajectory_loss_with_its_coefficients():
+def test_the_rollout_loss_is_the_trajectory_loss_with_its_coefficients():
     one, step, config = window(), jnp.array([0.1, -0.2, 0.3]), LossConfig(coefficient_change=0.5)
-    predicted, _ = rollouts.open_loop(Drift(), step, None, one, lambda _: None)
+    predicted, _ = objectives.open_loop(Drift(), step, None, one, lambda _: None)
     truth = VehicleState.from_vector(one.state[3:])
-    plain = OpenLoop(Drift(), config)(step, None, one)
+    plain = RolloutLoss(Drift(), config)(step, None, one)
     np.testing.assert_allclose(plain, trajectory_loss(config, predicted, truth), rtol=1e-6)
-    fused = OpenLoop(Drift(), config, lambda age: 0.1 * age * jnp.ones(4))(step, None, one)
+    fused = RolloutLoss(Drift(), config, lambda age: 0.1 * age * jnp.ones(4))(step, None, one)
     np.testing.assert_allclose(fused, plain + 0.5 * 4 * 0.01, rtol=1e-5)
 
 
-def test_the_one_step_objective_starts_every_step_from_the_record():
+def test_teacher_forcing_starts_every_step_from_the_record():
     one, step, deviation = window(), jnp.array([0.1, -0.2, 0.3]), tuple(0.1 * np.arange(1, 13))
     losses = []
     for before, after in zip(one.state[:-1], one.state[1:], strict=True):
         moved = before.at[:3].add(step)
         states = (VehicleState.from_vector(x) for x in (before, moved, after))
         losses.append(step_loss(jnp.array(deviation), *states))
-    found = OneStep(Drift(), deviation)(step, None, one)
+    found = TeacherForcingLoss(Drift(), deviation)(step, None, one)
     np.testing.assert_allclose(found, np.mean(losses), rtol=1e-5)
 
 
@@ -148,7 +139,7 @@ def test_batches_are_of_mirrored_windows_as_often_as_not(data, recorded):
 
 def test_validation_is_the_error_of_the_tables(data):
     params = bicycle_of(hmmwv())
-    problem = WindowProblem(BICYCLE, OpenLoop(BICYCLE), CONFIG)
+    problem = WindowProblem(BICYCLE, RolloutLoss(BICYCLE), CONFIG)
     found = jax.jit(problem.validate)(params, data)
     drive = np.arange(len(data.validation.world))
     test = TestWindows(data.validation, drive, data.validation_terrain)
@@ -170,7 +161,7 @@ def test_a_prediction_that_is_lost_counts_as_one_that_did_not_move(data):
         def step(self, params, terrain, history, state, command):
             return replace(state, position=state.position * jnp.nan), ()
 
-    found = WindowProblem(Lost(), OpenLoop(Lost()), CONFIG).validate(None, data)
+    found = WindowProblem(Lost(), RolloutLoss(Lost()), CONFIG).validate(None, data)
     state = np.asarray(data.validation.state)
     driven = np.linalg.norm(state[:, -1, :3] - state[:, 2, :3], axis=-1)
     rigid = np.asarray(data.validation.ground) == 0
@@ -182,7 +173,7 @@ def test_a_kind_of_ground_that_nobody_drove_on_has_no_error(recorded):
     drives, terrain = recorded
     rigid = jax.tree.map(lambda x: x[np.asarray(drives.world) == 2], drives)
     data = WindowData.of(CONFIG, (rigid, terrain), (rigid, terrain))
-    found = WindowProblem(ConstantVelocity(), OpenLoop(ConstantVelocity()), CONFIG).validate(
+    found = WindowProblem(ConstantVelocity(), RolloutLoss(ConstantVelocity()), CONFIG).validate(
         None, data
     )
     assert np.isnan(found["error_deformable"]) and np.isnan(found["error_transition"])
@@ -201,7 +192,7 @@ def test_a_bicycle_learns_from_chrono(data, tmp_path):
         trainable=("ride_height", "speed_lag"),
     )
     params = replace(bicycle_of(hmmwv()), ride_height=jnp.float32(0.8))
-    problem = WindowProblem(BICYCLE, OpenLoop(BICYCLE), CONFIG)
+    problem = WindowProblem(BICYCLE, RolloutLoss(BICYCLE), CONFIG)
     run = Run.create(tmp_path, "fit", config)
     fitted = fitting.fit(problem, config, params, data, jax.random.key(0), run)
     lines = runs.read_metrics(run.folder)

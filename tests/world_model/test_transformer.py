@@ -17,17 +17,40 @@ from world_model.examples import (
     rough,
 )
 
-from vertiwm_jax.dynamics import rollout, warm_up
+from vertiwm_jax.dynamics import along, rollout, warm_up
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.perception.features import init_pair, init_reduce
+from vertiwm_jax.perception.perceive import perceive
 from vertiwm_jax.state import Command, VehicleState
-from vertiwm_jax.world_model.sizes import BASE, PAPER
-from vertiwm_jax.world_model.specialist_network import WINDOW
-from vertiwm_jax.world_model.transformer_specialist import TransformerSpecialist
+from vertiwm_jax.world_model import motion, network
+from vertiwm_jax.world_model.alone import Alone
+from vertiwm_jax.world_model.network import BASE, PAPER, WINDOW
+from vertiwm_jax.world_model.transformer import Transformer
+from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
 KEY, TERRAIN = jax.random.key(0), rough()
-MODELS = {kind: TransformerSpecialist(TINY, kind) for kind in ("patches", "indicator", "none")}
+MODELS = {kind: Alone(Transformer(TINY, kind)) for kind in ("patches", "indicator", "none")}
 MODEL = MODELS["patches"]
-UNTRAINED = {kind: jax.jit(model.init_params)(KEY, CONSTANTS) for kind, model in MODELS.items()}
-PARAMS = {kind: moved(params) for kind, params in UNTRAINED.items()}
+
+
+def init_params(model, key=KEY):
+    """Untrained parameters of one specialist."""
+    encoders = replace(init_pair(key), reduce=init_reduce(key, TINY.channels))
+    own = model.specialist.init_params(key, CONSTANTS)
+    return VertiWMParams((encoders,), hmmwv(), transformer=own)
+
+
+def changed(params):
+    """Every weight that learns has moved from its first value."""
+    own, (encoders,), rng = moved(params.transformer), params.encoders, np.random.default_rng(1)
+    reduce = jax.tree.map(
+        lambda x: jnp.asarray(x + rng.normal(0, 0.1, x.shape), jnp.float32), encoders.reduce
+    )
+    return replace(params, transformer=own, encoders=(replace(encoders, reduce=reduce),))
+
+
+UNTRAINED = {kind: init_params(model) for kind, model in MODELS.items()}
+PARAMS = {kind: changed(params) for kind, params in UNTRAINED.items()}
 
 
 def predict(params, terrain, state, commands, model=MODEL):
@@ -40,7 +63,8 @@ predicted = jax.jit(predict, static_argnames="model")
 
 def test_sizes():
     base, paper = (
-        count(jax.eval_shape(TransformerSpecialist(size).init_params, KEY).network)
+        count(jax.eval_shape(Transformer(size).init_params, KEY).network)
+        + count(init_reduce(KEY, size.channels))
         for size in (BASE, PAPER)
     )
     assert 500_000 < base < 700_000
@@ -56,27 +80,25 @@ def test_starts_from_the_mean_transition():
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_cached_steps_along_a_drive_equal_the_whole_sequence(kind):
+def test_steps_along_a_drive_equal_the_whole_sequence(kind):
+    """Recorded states do not follow from each other as predicted ones do."""
     model, params, steps = MODELS[kind], PARAMS[kind], WINDOW + 9
-    drive = driving(1, steps)
+    drive, control = driving(1, steps), commands(steps)
+    found, _ = jax.jit(partial(along, model))(params, TERRAIN, drive, control)
 
     @jax.jit
-    def cached(params, states, commands):
-        def advance(carry, inputs):
-            state, command = inputs
-            # Recorded states do not follow from each other as predicted ones do.
-            history = replace(carry, perception=model.init(params, TERRAIN, state).perception)
-            proposed, history = model.step(params, TERRAIN, history, state, command)
-            return history, proposed
+    def at_once(params, states, commands):
+        own, constants = params.transformer, params.transformer.normalization
+        seen = jax.vmap(lambda state: perceive(params.encoders, TERRAIN, state))(states)
+        below = model.specialist._ground(TERRAIN, seen[0], states)
+        inputs = constants.inputs(states, commands)
+        output = network._Module(TINY).apply(own.network, inputs, below)
+        return motion.advance(states, constants.transition(output))
 
-        start = model.init(params, TERRAIN, one(states, 0))
-        return jax.lax.scan(advance, start, (states, commands))[1]
-
-    one_by_one = cached(params, drive, commands(steps))
-    at_once = jax.jit(model.follow)(params, TERRAIN, drive, commands(steps))
-    changes = np.abs(one_by_one.velocity - drive.velocity).max(-1)
+    expected = at_once(params, drive, control)
+    changes = np.abs(found.velocity - drive.velocity).max(-1)
     assert (changes > 1e-2).mean() > 0.8  # it does something
-    np.testing.assert_allclose(one_by_one.vector, at_once.vector, atol=2e-5)
+    np.testing.assert_allclose(found.vector, expected.vector, atol=2e-5)
 
 
 def test_history_sees_the_state_that_was_returned():
@@ -85,9 +107,9 @@ def test_history_sees_the_state_that_was_returned():
     history = init(params, TERRAIN, state)
     command = Command(jnp.float32(3), jnp.float32(0.2))
     after, following = step(params, TERRAIN, history, state, command)
-    expected = init(params, TERRAIN, after).perception
-    np.testing.assert_allclose(following.perception.latent, expected.latent, atol=1e-3)
-    assert float(jnp.abs(expected.latent - history.perception.latent).max()) > 0.1
+    (expected,) = init(params, TERRAIN, after).features
+    np.testing.assert_allclose(following.features[0].reduced, expected.reduced, atol=1e-3)
+    assert float(jnp.abs(expected.reduced - history.features[0].reduced).max()) > 0.1
 
 
 def test_a_batch_is_a_loop_and_one_trace_serves_all_drives():
@@ -177,13 +199,34 @@ def test_the_next_query_pose_counts_as_given():
 
 
 def test_encoders_and_constants_never_learn():
-    def loss(params):
-        return jnp.sum(MODEL.follow(params, TERRAIN, driving(0, 2), commands(2)).velocity ** 2)
+    model, drive = replace(MODEL, latents=True), driving(0, 2)
 
-    gradient = jax.jit(jax.grad(loss))(PARAMS["patches"])
-    assert not any(bool(np.any(x)) for x in jax.tree.leaves(gradient.encoders))
-    assert all(bool(np.any(x)) for x in jax.tree.leaves(gradient.network))
-    assert not any(bool(np.any(x)) for x in jax.tree.leaves(gradient.normalisation))
+    def loss(params):
+        predicted, _ = along(model, params, TERRAIN, drive, commands(2))
+        return jnp.sum(predicted.velocity**2)
+
+    gradient = jax.jit(jax.grad(loss, allow_int=True))(PARAMS["patches"])
+    (encoders,) = gradient.encoders
+    still = encoders.elevation, encoders.semantic, gradient.transformer.normalization
+    assert not any(bool(np.any(x)) for x in jax.tree.leaves(still))
+    learns = gradient.transformer.network, encoders.reduce
+    assert all(bool(np.any(x)) for x in jax.tree.leaves(learns))
+
+
+def test_the_first_layer_learns_only_from_latents():
+    def away(encoders, commands, model):
+        params, state = replace(PARAMS["patches"], encoders=encoders), driving()
+        return jnp.sum(predict(params, TERRAIN, state, commands, model).position[-1])
+
+    slope = jax.jit(jax.grad(away, argnums=1), static_argnums=2)
+    encoders, control = PARAMS["patches"].encoders, commands(8)
+    expected, found = (
+        slope(encoders, control, replace(MODEL, latents=kept)) for kept in (True, False)
+    )
+    np.testing.assert_allclose(found.vector, expected.vector, atol=1e-4)
+    assert np.any(expected.vector)
+    with pytest.raises(TypeError, match=r"encoders.reduce: expected a model that keeps latents"):
+        jax.grad(away)(encoders, control, MODEL)
 
 
 def test_gradients_through_a_warmed_up_rollout_are_finite():
@@ -194,7 +237,10 @@ def test_gradients_through_a_warmed_up_rollout_are_finite():
         state = jax.tree.map(lambda x: x[-1], drive)
         return jnp.sum(rollout(MODEL, params, TERRAIN, state, after, history).position[-1])
 
-    gradient, by_drive = jax.jit(jax.grad(loss, argnums=(0, 1)))(PARAMS["patches"], drive)
+    by_weights = jax.grad(
+        lambda own, drive: loss(replace(PARAMS["patches"], transformer=own), drive), argnums=(0, 1)
+    )
+    gradient, by_drive = jax.jit(by_weights)(PARAMS["patches"].transformer, drive)
     leaves = jax.tree.leaves((gradient, by_drive))
     assert all(np.isfinite(leaf).all() for leaf in leaves)
     assert all(np.any(leaf) for leaf in jax.tree.leaves(gradient.network))

@@ -10,8 +10,7 @@ import pytest
 from vertiwm_jax.evaluation import prediction
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.world_model.choice import choose, rounded
-from vertiwm_jax.world_model.model import VertiWM
+from vertiwm_jax.models.registry import load_model
 
 MIXED = Path(__file__).parents[2] / "data" / "open" / "mixed"
 
@@ -27,18 +26,18 @@ RECORDED = {"rigid": 0.0534, "deformable": 0.0918, "transition": 0.1121}
 
 
 @pytest.mark.smoke
-@pytest.mark.parametrize("operands", ["float32", "bfloat16"])
-def test_it_predicts_as_it_always_did(windows, operands):
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_it_predicts_as_it_always_did(windows, dtype):
     """So that what is changed for speed leaves predictions what they are, to rounding."""
-    model, params = choose("vertiwm")
-    errors = prediction.evaluate("it", model, rounded(params, operands), windows)
+    model, params = load_model("vertiwm", compute_dtype=dtype)
+    errors = prediction.evaluate("it", model, params, windows)
     found = {kind: interval.mean for kind, interval in errors.final["position"].items()}
     assert found == pytest.approx(RECORDED, rel=0.01)
 
 
 def mean_error(name, windows):
     errors, lost = prediction.absolute_errors(
-        prediction.predict(*choose(name), windows).states, windows
+        prediction.predict(*load_model(name), windows).states, windows
     )
     assert not lost.any(), name
     return errors["position"][:, -1].mean()
@@ -52,7 +51,7 @@ def test_it_predicts_better_than_what_it_is_made_of(windows):
 
 
 def test_its_weights_are_finite_and_few():
-    _, params = VertiWM.pretrained()
+    _, params = load_model("vertiwm")
     assert sum(x.size for x in jax.tree.leaves(params.gate.network)) == 4 * 33_764
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(params))
     assert {x.dtype for x in jax.tree.leaves(params)} == {jnp.dtype("float32")}

@@ -10,7 +10,7 @@ from vertiwm_jax.mechanics.simulator import SimulatorHistory
 from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.world_model import motion
-from vertiwm_jax.world_model.normalisation import LOCAL, Normalisation
+from vertiwm_jax.world_model.normalization import LOCAL, Normalization
 
 LARGEST = 8.0
 """Where features are cut off, lest a crash blind the network for a whole window."""
@@ -33,6 +33,25 @@ _OTHER_SIDE = np.array([1, 0, 3, 2])
 
 SIZE = _BODY_SIGNS.size + 4 * _WHEEL_SIGNS.size
 """Numbers in `StepFeatures.flat`."""
+
+
+def of(
+    constants: Normalization,
+    correction_scale: jax.Array,
+    vehicle: Vehicle,
+    expected: VehicleState,
+    state: VehicleState,
+    command: Command,
+    physics: VehicleState,
+    memory: SimulatorHistory,
+) -> jax.Array:
+    """`[2, ..., SIZE]` what the network reads of steps `[...]`, and in a mirror.
+
+    expected: what physics had made of `state`; physics, memory: what it makes of the next.
+    """
+    fixed = jax.lax.stop_gradient((constants, correction_scale, vehicle))
+    seen = StepFeatures.of(*fixed, expected, state, command, physics, memory)
+    return jnp.stack([seen.flat, seen.mirrored.flat])
 
 
 class StepFeatures(NamedTuple):
@@ -64,7 +83,7 @@ class StepFeatures(NamedTuple):
     @classmethod
     def of(
         cls,
-        constants: Normalisation,
+        constants: Normalization,
         correction_scale: jax.Array,
         vehicle: Vehicle,
         expected: VehicleState,
@@ -73,7 +92,7 @@ class StepFeatures(NamedTuple):
         physics: VehicleState,
         memory: SimulatorHistory,
     ) -> "StepFeatures":
-        """expected: what physics had made of `state`; physics, memory: what it makes of the next.
+        """As `of` has its arguments.
 
         Of the constants only deviations are used: with the means, a mirror would not be a change
         of signs.

@@ -9,8 +9,8 @@ from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.world_model import step_features
-from vertiwm_jax.world_model.step_features import StepFeatures
+from vertiwm_jax.world_model import nesam_inputs
+from vertiwm_jax.world_model.nesam_inputs import StepFeatures
 
 CONCRETE, SNOW = 1, 9
 VEHICLE = hmmwv()
@@ -47,7 +47,7 @@ def test_a_mirror_exchanges_left_and_right():
     steering = east.body[-1]
     assert float(steering) > 0
     assert float(image.body[-1]) == -float(steering)
-    assert east.flat.shape == (step_features.SIZE,)
+    assert east.flat.shape == (nesam_inputs.SIZE,)
     np.testing.assert_array_equal(image.mirrored.flat, east.flat)
 
 
@@ -67,4 +67,4 @@ def test_signs_are_those_of_a_mirrored_state():
 def test_large_values_are_cut_off():
     east = features(0.0)
     wild = east._replace(body=east.body.at[0].set(-1e9))
-    assert float(jnp.abs(wild.flat).max()) == step_features.LARGEST
+    assert float(jnp.abs(wild.flat).max()) == nesam_inputs.LARGEST

@@ -1,0 +1,157 @@
+"""Models by name, in the forms that drive, plan and are seen by."""
+
+from functools import partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from world_model.examples import commands, driving, one, rough
+
+from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.dynamics import embedding, rollout
+from vertiwm_jax.models import files
+from vertiwm_jax.models.config import ModelConfig, with_soil
+from vertiwm_jax.models.registry import load_fitted, load_model
+from vertiwm_jax.world_model.nesam import Nesam
+from vertiwm_jax.world_model.network import cast_weights
+
+TERRAIN, STATES, COMMANDS = rough(), driving(3, 5), commands(8)
+LEARNED = ("vertiwm", "transformer", "nesam")
+
+
+@partial(jax.jit, static_argnames="model")
+def drive(model, params, states):
+    def of_one(state):
+        history = model.init(params, TERRAIN, state)
+        return rollout(model, params, TERRAIN, history, state, COMMANDS)
+
+    return jax.vmap(of_one)(states)
+
+
+@pytest.mark.parametrize("name", ["vertiwm", "transformer"])
+def test_a_model_that_keeps_latents_drives_alike(name):
+    expected, found = (drive(*load_model(name, embeddings=kept), STATES) for kept in (False, True))
+    np.testing.assert_allclose(found.vector, expected.vector, atol=1e-3)
+
+
+def test_embeddings_are_kept_where_they_are_asked_for():
+    def seen(name, **asked):
+        model, params = load_model(name, **asked)
+        return embedding(jax.eval_shape(model.init, params, TERRAIN, one(STATES, 0)))
+
+    assert seen("vertiwm", embeddings=True).shape == (16, 16, 36)
+    assert seen("transformer", embeddings=True).shape == (16, 16, 36)
+    for name in (*LEARNED, "builtin", "bicycle"):
+        assert seen(name) is None
+    assert seen("nesam", embeddings=True) is None
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_matrices_are_those_of_the_transformers_alone(name):
+    (model, params), (_, half) = (
+        load_model(name, compute_dtype=dtype) for dtype in ("float32", "bfloat16")
+    )
+    small = {
+        jax.tree_util.keystr(path)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(half)
+        if leaf.dtype == jnp.bfloat16
+    }
+    # Of each network, four matrices in each of three layers, and what embeds the ground in one.
+    assert len(small) == {"vertiwm": 25, "transformer": 13, "nesam": 12}[name]
+    assert all("network" in leaf and "kernel" in leaf for leaf in small)
+    expected, found = drive(model, params, STATES), drive(model, half, STATES)
+    assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype("float32")}
+    assert not np.array_equal(found.vector, expected.vector)
+    np.testing.assert_allclose(found.position, expected.position, atol=0.01)
+    chex.assert_trees_all_equal(cast_weights(params, "float32"), params)
+
+
+def test_commands_move_what_has_rounded_matrices():
+    """As planners by gradients need it."""
+
+    def away(model, params, commands):
+        state = one(STATES, 0)
+        history = model.init(params, TERRAIN, state)
+        return jnp.sum(rollout(model, params, TERRAIN, history, state, commands).position[-1])
+
+    by_commands = jax.jit(jax.grad(away, argnums=2), static_argnums=0)
+    expected, found = (
+        by_commands(*load_model("transformer", compute_dtype=dtype), COMMANDS)
+        for dtype in ("float32", "bfloat16")
+    )
+    apart = np.linalg.norm(found.vector - expected.vector)
+    assert 0 < apart < 0.05 * np.linalg.norm(expected.vector)
+
+
+def test_gradients_through_physics_are_exact_where_they_are_asked_for():
+    fused, alone = (load_model(name, exact_gradient=True)[0] for name in ("vertiwm", "nesam"))
+    for nesam in (fused.nesam, alone.specialist):
+        assert isinstance(nesam, Nesam) and nesam.gradient == "exact"
+    assert load_model("vertiwm")[0].nesam.gradient == "mean"
+
+
+def test_soils_are_predicted_where_they_are_asked_for():
+    for name in ("vertiwm", "nesam"):
+        predicted, of_map = (load_model(name, soil=soil)[1] for soil in ("predicted", "map"))
+        assert predicted.encoders[-1].soil is not None
+        assert not of_map.encoders or of_map.encoders[-1].soil is None
+
+
+def filled(leaf):
+    return leaf if leaf.any() else jax.random.normal(jax.random.key(1), leaf.shape) / 50
+
+
+@pytest.mark.parametrize("encoders", ["own", "shared"])
+@pytest.mark.parametrize("terrain", ["patches", "indicator"])
+def test_what_was_saved_is_loaded_by_its_parts(tmp_path, encoders, terrain):
+    parts = ("transformer", "nesam") if terrain != "patches" else ("transformer", "nesam", "gate")
+    config = ModelConfig(parts, terrain=terrain, encoders=encoders)
+    params = config.init_params(jax.random.key(0), load_model("builtin")[1])
+    files.save(tmp_path, config, params)
+    found, loaded = files.load(tmp_path)
+    assert found == config
+    chex.assert_trees_all_equal(loaded, jax.tree.map(jnp.asarray, params))
+    fitted = load_fitted(tmp_path)
+    assert set(fitted) == {"transformer", "nesam"} | ({"vertiwm"} if "gate" in parts else set())
+    if "gate" in parts:
+        whole = jax.tree.map(filled, with_soil(params, None))
+        drives = drive(config.verti_wm, whole, STATES)
+        assert np.isfinite(drives.vector).all()
+    else:
+        with pytest.raises(CheckpointError, match="expected vertiwm, found nesam and transformer"):
+            load_model("vertiwm", tmp_path)
+
+
+def _as_before(params):
+    """Parameters as version 0.1 wrote them."""
+    own, nesam = params.transformer, params.nesam
+    first, last = params.encoders[0], params.encoders[-1]
+    pair = {"elevation": first.elevation, "semantic": first.semantic}
+    network = {"params": {**own.network["params"], "reduce": first.reduce}}
+    return {
+        "transformer": {
+            "network": network,
+            "encoders": pair,
+            "normalisation": own.normalization,
+        },
+        "nesam": {
+            "network": nesam.network,
+            "encoders": {"elevation": last.elevation, "semantic": last.semantic},
+            "soil": last.soil,
+            "simulator": nesam.physics(params.vehicle),
+            "normalisation": nesam.normalization,
+            "correction_scale": nesam.correction_scale,
+            "response": nesam.response,
+        },
+        "gate": params.gate,
+    }
+
+
+@pytest.mark.parametrize("encoders", ["own", "shared"])
+def test_models_of_before_are_read(tmp_path, encoders):
+    config = ModelConfig(encoders=encoders)
+    params = config.init_params(jax.random.key(0), load_model("builtin")[1])
+    files.save(tmp_path, config, _as_before(params))
+    chex.assert_trees_all_equal(files.load(tmp_path)[1], jax.tree.map(jnp.asarray, params))

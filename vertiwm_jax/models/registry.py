@@ -1,0 +1,101 @@
+"""Every model of this package by name."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
+from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
+from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
+from vertiwm_jax.models import files
+from vertiwm_jax.models.config import SoilSource, with_soil
+from vertiwm_jax.perception.features import Encoders
+from vertiwm_jax.world_model.alone import Alone
+from vertiwm_jax.world_model.network import ComputeDtype, cast_weights
+from vertiwm_jax.world_model.verti_wm import VertiWMParams
+
+ModelName = Literal["builtin", "transformer", "nesam", "vertiwm"]
+"""The simulator, which has learned nothing; either specialist; both of them fused."""
+Imagined = Literal["bicycle", "builtin", "transformer", "nesam", "vertiwm"]
+"""What a planner may imagine in: those, and a kinematic bicycle, which knows no forces."""
+
+
+def load_model(
+    name: Imagined = "vertiwm",
+    weights: str | Path | None = None,
+    *,
+    vehicle: Vehicle | None = None,
+    soil: SoilSource | None = None,
+    embeddings: bool = False,
+    compute_dtype: ComputeDtype = "float32",
+    exact_gradient: bool = False,
+) -> tuple[Dynamics, Params]:
+    """A model and its parameters.
+
+    Args:
+        name: which one.
+        weights: folder of a fitted model; the one that comes with the package by default.
+        vehicle: of simulator and bicycle, the HMMWV by default. Learned models move the vehicle
+            that they were fitted to.
+        soil: where NeSAM has soils from, if not from where it had them when it was fitted.
+        embeddings: whether histories keep the latents that the Transformer sees, for a policy to
+            see them (`dynamics.embedding`). Models without a Transformer keep none.
+        compute_dtype: what learned models multiply large matrices in; see `cast_weights`.
+        exact_gradient: whether gradients go through the physics of NeSAM as it is, as planning by
+            gradients and adapting soils need it. Fitting needs only how physics answers on the
+            whole (`Nesam.gradient`), which is several times cheaper.
+
+    Raises:
+        CheckpointError, ConfigError: as `files.load`, and when the folder holds other parts alone.
+    """
+    if name == "builtin":
+        return Simulator(), chrono_like(vehicle or hmmwv())
+    if name == "bicycle":
+        return KinematicBicycle(), bicycle_of(vehicle or hmmwv())
+    folder = Path(weights or files.PRETRAINED)
+    found = load_fitted(folder, soil, embeddings, exact_gradient)
+    if name not in found:
+        raise CheckpointError(f"{folder}: expected {name}, found {' and '.join(found)} alone")
+    dynamics, params = found[name]
+    return dynamics, cast_weights(params, compute_dtype)
+
+
+def load_fitted(
+    folder: Path,
+    soil: SoilSource | None = None,
+    embeddings: bool = False,
+    exact_gradient: bool = False,
+) -> dict[ModelName, tuple[Dynamics, VertiWMParams]]:
+    """The models that are fitted in a folder, and their parameters; as `load_model`."""
+    config, params = files.load(folder)
+    if (soil or config.soil) == "map":
+        params = with_soil(params, None)
+    nesam = replace(config.nesam, gradient="exact" if exact_gradient else "mean")
+    models: dict[ModelName, tuple[Dynamics, VertiWMParams]] = {}
+    if "gate" in config.parts:
+        fused = replace(config.verti_wm, nesam=nesam, latents=embeddings)
+        models["vertiwm"] = fused, params
+    if "nesam" in config.parts:
+        alone = Alone(nesam)
+        models["nesam"] = alone, alone.part_of(params)
+    if "transformer" in config.parts:
+        alone = Alone(config.transformer, embeddings and config.terrain == "patches")
+        models["transformer"] = alone, alone.part_of(params)
+    return models
+
+
+def load_encoders(weights: str | Path | None = None) -> Encoders:
+    """The Transformer's encoders, by which policies see the ground in whatever they drive.
+
+    Raises like `load_model`, with "transformer".
+    """
+    folder = Path(weights or files.PRETRAINED)
+    config, params = files.load(folder)
+    if "transformer" not in config.parts or config.terrain != "patches":
+        raise CheckpointError(
+            f"{folder}: expected the encoders of a Transformer, for navigation.embeddings, "
+            f"found {' and '.join(config.parts)} with terrain {config.terrain!r}"
+        )
+    return replace(params.encoders[0], reduce=None, soil=None)

@@ -1,0 +1,86 @@
+"""One specialist as a model of its own."""
+
+from dataclasses import dataclass, replace
+
+from flax import struct
+
+from vertiwm_jax.dynamics import History
+from vertiwm_jax.perception.features import Encoders, TerrainFeatures
+from vertiwm_jax.perception.perceive import perceive, reduced
+from vertiwm_jax.state import Command, VehicleState
+from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model.nesam import Nesam
+from vertiwm_jax.world_model.transformer import Transformer
+from vertiwm_jax.world_model.verti_wm import VertiWMParams
+
+
+@struct.dataclass
+class AloneHistory:
+    """features: of the ground at the current state; none of a specialist that sees nothing.
+
+    specialist: its own history.
+    """
+
+    features: tuple[TerrainFeatures, ...]
+    specialist: History
+
+
+@dataclass(frozen=True)
+class Alone:
+    """The `Dynamics` of one specialist: it proposes, and is where it has proposed to be.
+
+    It reads its part of `VertiWMParams`.
+    latents: as of `VertiWM`.
+    """
+
+    specialist: Transformer | Nesam
+    latents: bool = False
+
+    def init(self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState) -> AloneHistory:
+        """The specialist's history, and a look at the ground."""
+        specialist, own = self._own(params)
+        begun = specialist.init(own, params.vehicle, terrain, state)
+        return AloneHistory(self.see(params, terrain, state), begun)
+
+    def see(
+        self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState
+    ) -> tuple[TerrainFeatures, ...]:
+        """What the specialist needs to know of the ground at a state (Eq. 1)."""
+        encoders = self._encoders(params.encoders)
+        return perceive(encoders, terrain, state, self.latents) if encoders else ()
+
+    def step(
+        self,
+        params: VertiWMParams,
+        terrain: TerrainMap,
+        history: AloneHistory,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, AloneHistory]:
+        """The proposed state (Eq. 2), and a look at the ground there."""
+        specialist, own = self._own(params)
+        seen = None
+        if history.features:
+            (seen,) = reduced(self._encoders(params.encoders), history.features)
+        state, after = specialist.propose(
+            own, params.vehicle, terrain, seen, history.specialist, state, command
+        )
+        return state, AloneHistory(self.see(params, terrain, state), after)
+
+    def part_of(self, params: VertiWMParams) -> VertiWMParams:
+        """The parameters without what it does not read."""
+        encoders = self._encoders(params.encoders)
+        if isinstance(self.specialist, Transformer):
+            return VertiWMParams(encoders, params.vehicle, transformer=params.transformer)
+        return VertiWMParams(encoders, params.vehicle, nesam=params.nesam)
+
+    def _own(self, params: VertiWMParams) -> tuple:
+        part = params.transformer if isinstance(self.specialist, Transformer) else params.nesam
+        return self.specialist, part
+
+    def _encoders(self, encoders: tuple[Encoders, ...]) -> tuple[Encoders, ...]:
+        """Those of the specialist, without what it does not ask."""
+        if isinstance(self.specialist, Nesam):
+            return tuple(replace(x, reduce=None) for x in encoders[-1:] if x.soil is not None)
+        sees = self.specialist.terrain == "patches"
+        return tuple(replace(x, soil=None) for x in encoders[:1]) if sees else ()
