@@ -65,7 +65,7 @@ def test_the_table_of_the_paper_is_configured():
 
 def test_tables_without_sense_are_refused(tmp_path):
     row = Row("ppo", "nesam")
-    with pytest.raises(ValueError, match="expected at least one of each"):
+    with pytest.raises(ValueError, match="rows: expected at least one"):
         CompareConfig(rows=())
     with pytest.raises(ValueError, match="once"):
         CompareConfig(rows=(row, row))
