@@ -61,6 +61,7 @@ PUBLIC = {
         "learning.dataset.Drives",
         "prediction_errors",
         "fit",
+        "identify",
         "adaptation.soil_filter.SoilFilter",
     ),
     "The task": (

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from vertiwm_jax.evaluation.prediction import prediction_errors as prediction_errors
     from vertiwm_jax.learning.dataset import load_drives as load_drives
     from vertiwm_jax.learning.experiment import fit as fit
+    from vertiwm_jax.learning.identification import identify as identify
     from vertiwm_jax.mechanics.kinematic import place as place
     from vertiwm_jax.mechanics.vehicle import Vehicle as Vehicle
     from vertiwm_jax.mechanics.vehicle import load_vehicle as load_vehicle
@@ -43,6 +44,7 @@ _PUBLIC = {
     "VehicleState": "state",
     "evaluate": "evaluation.navigation",
     "fit": "learning.experiment",
+    "identify": "learning.identification",
     "load_drives": "learning.dataset",
     "load_map": "terrain.files",
     "load_model": "models.registry",

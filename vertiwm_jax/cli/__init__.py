@@ -1,4 +1,4 @@
-"""The command line: `vertiwm COMMAND ...`, and `python -m vertiwm_jax.COMMAND ...` for most.
+"""The command line: `vertiwm COMMAND ...`, for most also `python -m vertiwm_jax.COMMAND ...`.
 
 Each module of this package is one command, or several that differ in a name: `run` reads the rest
 of the command line, calls the library, and prints what came of it.
@@ -29,6 +29,7 @@ COMMANDS = {
     "make_logs": "make_logs",
     "export": "export",
     "view": "view",
+    "identify": "identify",
 }
 """Commands, and the modules that run them."""
 _RESUME = "go on from the newest checkpoint with --resume and the run folder"
