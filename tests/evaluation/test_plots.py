@@ -39,6 +39,27 @@ def test_trajectories_show_every_drive():
     assert roll.lines[0].get_linestyle() != roll.lines[1].get_linestyle()
     figure.savefig(file := io.BytesIO())
     assert file.getvalue()[:4] == b"\x89PNG"
+    (legend,) = figure.legends
+    said = [text.get_text() for text in legend.get_texts()]
+    assert said == [
+        "learned",
+        "straight to goal",
+        "goal, in a circle of 8 m",
+        "end of a drive",
+        "start",
+        "grass",
+    ]
+    assert overhead.get_title() == "world 0"
+
+
+def test_maps_are_shown_with_a_legend_of_their_ground():
+    semantic = np.full((16, 16), GRASS)
+    semantic[0, 0] = SNOW
+    snowy = terrain_map.build(hills(), semantic)
+    figure = terrain_map.stack([ground(obstacles=[[0, 0, 4, 4, 2]]), snowy]).plot(["plain", "hill"])
+    assert [axes.get_title() for axes in figure.axes] == ["plain", "hill"]
+    said = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert said == ["grass", "snow", "rock or tree"]
 
 
 def test_learning_curves_draw_every_metric_of_every_run():

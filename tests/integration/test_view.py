@@ -13,6 +13,8 @@ from viewing.test_recording import read
 from vertiwm_jax.cli import view
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity
 from vertiwm_jax.rl.experiment import SACTraining
+from vertiwm_jax.terrain import files
+from vertiwm_jax.terrain import map as terrain_map
 
 TINY = """
 ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 2}
@@ -50,6 +52,17 @@ def test_a_recorded_drive(uniform, tmp_path, capsys, monkeypatch):
         assert image.n_frames == recordings.STEPS / 2 + 1
     names = {"a.npz", "maps", "a-drive-4.rrd", "other.rrd", "a.gif"}
     assert {path.name for path in tmp_path.iterdir()} == names
+
+
+def test_maps_are_drawn_beside_them(tmp_path, capsys):
+    level = terrain_map.build(np.zeros((33, 33)), np.full((4, 4), 3))
+    for name in ("a", "b"):
+        files.save(level, tmp_path / f"{name}.npz")
+    for source, drawn in (("a.npz", "a.png"), ("", "maps.png")):
+        door("view")([str(tmp_path / source)])
+        assert str(tmp_path / drawn) in capsys.readouterr().out
+        with Image.open(tmp_path / drawn) as image:
+            assert image.format == "PNG"
 
 
 def test_another_vehicle_is_shown_as_large_as_it_is(uniform, tmp_path):

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,20 +15,23 @@ from vertiwm_jax.config import ConfigError, CountOrZero, settings
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.suites import Suite
 from vertiwm_jax.errors import UserError
+from vertiwm_jax.evaluation import plots
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.models.registry import ModelName, load_model
 from vertiwm_jax.rl import experiment
+from vertiwm_jax.terrain.files import load_map
 from vertiwm_jax.viewing import driven, movie, recorded
 from vertiwm_jax.viewing.scene import Scene
 
 
 @settings
 class View:
-    """Show how a policy drives a task, or a recorded drive with what a model predicts of it."""
+    """Show maps, how a policy drives a task, or a recorded drive with what a model predicts."""
 
     source: tyro.conf.Positional[Path]
-    """Run folder of a policy's training, or an .npz file of recorded drives."""
+    """An .npz map or a folder of maps, the run folder of a policy's training, or an .npz file of
+    recorded drives."""
     model: ModelName = "vertiwm"
     """What a policy drives in, or whose predictions are shown beside a recorded drive."""
     weights: Path | None = None
@@ -43,7 +47,7 @@ class View:
     drive: CountOrZero | None = None
     """Which drive of a file; the first by default."""
     output: Path | None = None
-    """File of the recording; beside what is shown by default."""
+    """File of the recording, or of the picture of maps; beside what is shown by default."""
     open: bool = False
     """Whether to open the recording in the rerun viewer."""
     movie: Path | None = None
@@ -59,6 +63,9 @@ class View:
 
 def run(name: str, words: Sequence[str]) -> None:
     command = arguments.read(View, name, words)
+    if _are_maps(command.source):
+        print(f"the picture is {_picture(command)}")
+        return
     path = view(command)
     if command.movie:
         print(f"the movie is {path}")
@@ -68,6 +75,28 @@ def run(name: str, words: Sequence[str]) -> None:
         status = subprocess.call([sys.executable, "-m", "rerun", str(path)])
         if status:
             raise UserError(f"{path}: the rerun viewer ended with status {status}")
+
+
+def _are_maps(source: Path) -> bool:
+    """Whether it is a map, or a folder of maps, and not a run or a file of drives."""
+    if source.is_dir():
+        files = [*source.glob("*.npz"), *source.glob("envs")]
+        return bool(files) and not (source / "config.yaml").exists()
+    if not zipfile.is_zipfile(source):
+        return False
+    with zipfile.ZipFile(source) as file:
+        return "elevation.npy" in file.namelist() and "state.npy" not in file.namelist()
+
+
+def _picture(command: View) -> Path:
+    """Draws the maps from above; the file."""
+    source = command.source
+    path = command.output or (
+        source / "maps.png" if source.is_dir() else source.with_suffix(".png")
+    )
+    files = sorted(source.glob("*.npz")) if source.is_dir() else [source]
+    plots.save(load_map(source).plot([file.stem for file in files] or None), path)
+    return path
 
 
 def view(command: View) -> Path:

@@ -6,6 +6,8 @@ from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.terrain.map import TerrainMap
 
 _PIXELS_A_VERTEX = 4
+OBSTACLE = 0.15
+"""Shade of gray of rocks and trees."""
 _VEHICLE, _GOAL = (0.80, 0.05, 0.05), (0.00, 0.25, 0.75)
 
 
@@ -13,6 +15,11 @@ def extent(terrain: TerrainMap) -> tuple[float, float, float, float]:
     """West, east, south and north edge of the map, m."""
     (west, south), (east, north) = np.asarray(terrain.extent).tolist()
     return west, east, south, north
+
+
+def pale(rgb: np.ndarray) -> np.ndarray:
+    """`[..., 3]` colors of ground classes, 0 to 255, as maps are tinted, in [0, 1]."""
+    return 0.45 + 0.55 * rgb / 255
 
 
 def shaded(terrain: TerrainMap, world: int, enlarge: int = _PIXELS_A_VERTEX) -> np.ndarray:
@@ -36,14 +43,14 @@ def shaded(terrain: TerrainMap, world: int, enlarge: int = _PIXELS_A_VERTEX) -> 
         np.minimum(at / (n - 1) * cells, cells - 1).astype(int)
         for at, n, cells in zip(centre, (rows, columns), semantic.shape, strict=True)
     )
-    tint = np.asarray(terrain.class_rgb)[semantic[row[:, None], column]] / 255
-    picture = (0.45 + 0.55 * tint) * (0.35 + 0.75 * np.clip(shade, 0, 1))[..., None]
+    tint = pale(np.asarray(terrain.class_rgb)[semantic[row[:, None], column]])
+    picture = tint * (0.35 + 0.75 * np.clip(shade, 0, 1))[..., None]
     x = float(terrain.origin[0]) + centre[1] * float(terrain.resolution)
     y = float(terrain.origin[1]) - centre[0] * float(terrain.resolution)
     for left, north, wide, tall, height in np.asarray(terrain.obstacles[world]):
         if height > 0:
             over = (np.abs(y - north) <= tall / 2)[:, None] & (np.abs(x - left) <= wide / 2)
-            picture[over] = 0.15
+            picture[over] = OBSTACLE
     return np.clip(picture, 0, 1)
 
 

@@ -17,10 +17,12 @@ from vertiwm_jax.terrain.map import TerrainMap
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
 # Okabe and Ito (2008), without the yellow that vanishes on paper; dashes tell the rest.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 _DASHES = ("-", "--", "-.", ":")
+_MARK: dict[str, Any] = {"color": "black", "markeredgecolor": "white", "linestyle": "none"}
 _STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -33,6 +35,28 @@ _STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "savefig.dpi": 160,
 }
+
+
+def worlds(terrain: TerrainMap, names: Sequence[str] | None = None, most: int = 12) -> Figure:
+    """The worlds of a map from above, up to `most` of them, with a legend of their ground.
+
+    names: of all worlds; their numbers by default.
+    """
+    names = names or [f"world {world}" for world in range(terrain.worlds)]
+    shown = range(min(terrain.worlds, most))
+    columns = min(len(shown), 4)
+    rows = math.ceil(len(shown) / columns)
+    size = 4.6 if len(shown) == 1 else 3.0
+    with style():
+        figure = sheet(size * columns, size * rows + 0.5)
+        panels = figure.subplots(rows, columns, squeeze=False)
+        for world, axes in zip(shown, panels.flat, strict=False):
+            _draw_map(axes, terrain, world, names[world])
+        for axes in panels.flat[len(shown) :]:
+            axes.set_axis_off()
+        legend = _ground_legend(terrain, shown)
+        figure.legend(handles=legend, loc="outside upper center", ncols=min(len(legend), 6))
+    return figure
 
 
 def trajectories(
@@ -54,16 +78,24 @@ def trajectories(
         overhead = figure.add_subplot(grid[:, 0])
         roll = figure.add_subplot(grid[0, 1])
         pitch = figure.add_subplot(grid[1, 1], sharex=roll)
-        _draw_map(overhead, terrain, world)
+        _draw_map(overhead, terrain, world, f"world {world}")
         overhead.add_patch(_circle(goal, goal_radius))
-        overhead.plot(goal[0], goal[1], "*", color="black", markersize=9, markeredgecolor="white")
+        overhead.plot(
+            *goal[:2],
+            "*",
+            **_MARK,
+            markersize=9,
+            zorder=4,
+            label=f"goal, in a circle of {goal_radius:g} m",
+        )
         for i, (name, (position, rpy)) in enumerate(drives.items()):
             colour, dash = line(i)
             x, y = position[:, 0], position[:, 1]
             overhead.plot(x, y, color="white", linewidth=3.2, alpha=0.8)
             overhead.plot(x, y, dash, label=name, linewidth=1.8, color=colour)
-            overhead.plot(x[0], y[0], "o", color="black", markersize=5, markeredgecolor="white")
-            overhead.plot(x[-1], y[-1], "s", color=colour, markersize=5)
+            start, end = ("start", "end of a drive") if i == 0 else (None, None)
+            overhead.plot(x[-1], y[-1], "s", color=colour, markersize=5, label=end)
+            overhead.plot(x[0], y[0], "o", **_MARK, markersize=5, label=start)
             seconds = step_seconds * np.arange(len(rpy))
             for axes, angle in ((roll, rpy[:, 0]), (pitch, rpy[:, 1])):
                 axes.plot(seconds, np.degrees(angle), dash, color=colour)
@@ -71,7 +103,11 @@ def trajectories(
         pitch.set_ylabel("pitch [deg], nose down")
         pitch.set_xlabel("time [s]")
         roll.tick_params(labelbottom=False)
-        figure.legend(*overhead.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+        lines = [shown for shown in overhead.lines if not str(shown.get_label()).startswith("_")]
+        drawn = [shown for shown in lines if shown.get_label() in drives]
+        handles: list[Any] = drawn + [shown for shown in lines if shown not in drawn]
+        handles += _ground_legend(terrain, [world])
+        figure.legend(handles=handles, loc="outside upper center", ncols=4)
     return figure
 
 
@@ -121,11 +157,22 @@ def line(i: int) -> tuple[str, str]:
     return _COLOURS[i % len(_COLOURS)], _DASHES[i % len(_DASHES)]
 
 
-def _draw_map(axes: Axes, terrain: TerrainMap, world: int) -> None:
+def _draw_map(axes: Axes, terrain: TerrainMap, world: int, title: str) -> None:
     axes.imshow(render.shaded(terrain, world), extent=render.extent(terrain))
     axes.grid(False)
-    axes.set_xlabel("x [m], east")
-    axes.set_ylabel("y [m], north")
+    axes.set(xlabel="x [m], east", ylabel="y [m], north", title=title)
+
+
+def _ground_legend(terrain: TerrainMap, shown: Sequence[int]) -> list[Patch]:
+    """A color for each class of ground in some worlds, and for obstacles."""
+    from matplotlib.patches import Patch
+
+    present = np.unique(np.asarray(terrain.semantic)[list(shown)])
+    colors = render.pale(np.asarray(terrain.class_rgb))
+    legend = [Patch(facecolor=tuple(colors[k]), label=terrain.class_names[k]) for k in present]
+    if (np.asarray(terrain.obstacles)[list(shown), :, 4] > 0).any():
+        legend.append(Patch(facecolor=str(render.OBSTACLE), label="rock or tree"))
+    return legend
 
 
 def _circle(centre: np.ndarray, radius: float):

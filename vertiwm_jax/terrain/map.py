@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,9 @@ from vertiwm_jax.terrain import soil
 from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.soil import Soil
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # What stacked worlds have in common.
 _SHARED = ("origin", "resolution", "class_rgb", "deformable")
@@ -77,6 +80,15 @@ class TerrainMap:
         """`[2]` m along x and along y."""
         rows, columns = self.elevation.shape[-2:]
         return self.resolution * jnp.array([columns - 1.0, rows - 1.0])
+
+    def plot(self, names: Sequence[str] | None = None) -> "Figure":
+        """The worlds from above, with a legend of their ground; a figure of matplotlib.
+
+        names: of all worlds; their numbers by default.
+        """
+        from vertiwm_jax.evaluation import plots
+
+        return plots.worlds(self, names)
 
     @property
     def extent(self) -> tuple[jax.Array, jax.Array]:
