@@ -10,3 +10,8 @@ class UserError(Exception):
 
 class TrainingInterrupted(Exception):
     """The user stopped the training; the message says where it was saved."""
+
+
+def one_line(error: Exception) -> str:
+    """What an error of another package says, and its kind, on one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())

@@ -33,6 +33,8 @@ ENDINGS: dict[str, Format] = {
     ".csv": "csv",
     ".parquet": "parquet",
     ".bag": "rosbag",
+    ".db3": "rosbag",
+    ".mcap": "rosbag",
     ".pt": "tartandrive",
 }
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from vertiwm_jax.errors import one_line
 from vertiwm_jax.importers import log
 from vertiwm_jax.importers.log import Log
 from vertiwm_jax.importers.settings import ImportSettings
@@ -96,6 +97,8 @@ def messages(path: Path, topic: str, kinds: Sequence[str]) -> Iterator[tuple[int
     Raises `DataError` where the bag cannot be read, or has no such messages.
     """
     highlevel, typesys = _rosbags(path)
+    if path.suffix in (".db3", ".mcap"):  # Of a folder that says what is in it.
+        path = path.parent
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     for kind, text in DEFINITIONS.items():
         store.register(typesys.get_types_from_msg(text, kind))
@@ -103,16 +106,20 @@ def messages(path: Path, topic: str, kinds: Sequence[str]) -> Iterator[tuple[int
         with highlevel.AnyReader([path], default_typestore=store) as reader:
             found = [c for c in reader.connections if c.topic == topic]
             others = sorted({c.msgtype for c in found} - set(kinds))
-            if others or not sum(c.msgcount for c in found):
-                every = ", ".join(sorted({c.topic for c in reader.connections}))
-                raise DataError(
-                    f"{path}: {topic}: expected messages of {' or '.join(kinds)}, found "
-                    + (", ".join(others) if others else f"none; there is {every or 'nothing'}")
-                )
-            for connection, received, data in reader.messages(found):
+            expected = f"{path}: {topic}: expected messages of {' or '.join(kinds)}"
+            if others:
+                raise DataError(f"{expected}, found {', '.join(others)}")
+            read = 0
+            for connection, received, data in reader.messages(found) if found else ():
                 yield received, reader.deserialize(data, connection.msgtype)
-    except (highlevel.AnyReaderError, OSError) as error:
-        raise DataError(f"{path}: expected a ROS bag: {error}") from None
+                read += 1
+            if not read:
+                every = ", ".join(sorted({c.topic for c in reader.connections}))
+                raise DataError(f"{expected}, found none; there is {every or 'nothing'}")
+    except DataError:
+        raise
+    except Exception as error:  # Of databases, YAML and messages, each in its own way.
+        raise DataError(f"{path}: expected a ROS bag: {one_line(error)}") from None
 
 
 def _stamp(received: int, message: Any, by_header: bool) -> float:

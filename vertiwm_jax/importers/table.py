@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vertiwm_jax.errors import one_line
 from vertiwm_jax.importers import log
 from vertiwm_jax.importers.log import Log
 from vertiwm_jax.importers.settings import ImportSettings, Table
@@ -95,6 +96,8 @@ def _csv_columns(path: Path, names: Sequence[str]) -> Columns:
             places = [head.index(name) for name in names]
             cells = []
             for row in rows:
+                if not any(cell.strip() for cell in row):
+                    continue
                 if len(row) != len(head):
                     raise DataError(
                         f"{path}: line {rows.line_num}: expected {len(head)} values as in the "
@@ -110,7 +113,6 @@ def _csv_columns(path: Path, names: Sequence[str]) -> Columns:
 
 def _parquet_columns(path: Path, names: Sequence[str]) -> Columns:
     try:
-        import pyarrow
         from pyarrow import parquet
     except ImportError:
         raise DataError(
@@ -121,9 +123,11 @@ def _parquet_columns(path: Path, names: Sequence[str]) -> Columns:
         file = parquet.ParquetFile(path)
         _check_head(path, names, file.schema_arrow.names)
         table = file.read(columns=list(names))
-    except pyarrow.ArrowException as error:
-        raise DataError(f"{path}: expected a Parquet file: {error}") from None
-    return {name: table[name].to_numpy() for name in names}
+        return {name: table[name].to_numpy() for name in names}
+    except DataError:
+        raise
+    except Exception as error:  # Of pyarrow, of which some are not its own.
+        raise DataError(f"{path}: expected a Parquet file: {one_line(error)}") from None
 
 
 def _check_head(path: Path, names: Sequence[str], head: Sequence[str]) -> None:

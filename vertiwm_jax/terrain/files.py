@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from vertiwm_jax import froude
+from vertiwm_jax.errors import one_line
 from vertiwm_jax.terrain import query, soil, vertibench
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.map import MapError, TerrainMap, build, stack
@@ -169,7 +170,7 @@ def _load_world(path: Path) -> TerrainMap:
         with np.load(path, allow_pickle=False) as file:
             arrays = {field: file[field] for field in file.files}
     except Exception as error:  # Of zip files, of what they compress and of NumPy's headers.
-        raise MapError(name, "file", "an .npz map", _one_line(error)) from None
+        raise MapError(name, "file", "an .npz map", one_line(error)) from None
     wanted = ("elevation", "patch_class", "patch_friction", "obstacles", "class_rgb", "meta")
     for field in (*wanted, "resolution", "origin"):
         if field not in arrays:
@@ -194,12 +195,8 @@ def _load_world(path: Path) -> TerrainMap:
         raise MapError(name, "meta", "JSON text", str(error)) from None
     except (TypeError, ValueError, AttributeError) as error:
         raise MapError(
-            name, "file", "a map's fields", f"one ill-typed: {_one_line(error)}"
+            name, "file", "a map's fields", f"one ill-typed: {one_line(error)}"
         ) from None
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def _classes(meta: dict, rgb: np.ndarray, name: str) -> GroundClasses:
@@ -262,7 +259,7 @@ def _read_raster(path: Path, field: str) -> np.ndarray:
     except MapError:
         raise
     except Exception as error:  # Of as many kinds as there are formats.
-        raise MapError(str(path), field, "a PNG, .npy or GeoTIFF file", _one_line(error)) from None
+        raise MapError(str(path), field, "a PNG, .npy or GeoTIFF file", one_line(error)) from None
 
 
 def _read_classes(path: Path, classes: GroundClasses) -> np.ndarray:

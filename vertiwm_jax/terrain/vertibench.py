@@ -26,8 +26,9 @@ def load(folder: str | Path, numbers: Iterable[int] | None = None) -> TerrainMap
     Raises `MapError` naming the file and the field.
     """
     maps = Path(folder) / _FOLDER
-    if not maps.is_dir():
-        raise MapError(str(folder), "folder", f"a checkout that holds {_FOLDER}", "no such folder")
+    if not (maps / "Worlds").is_dir():
+        expected = f"a checkout that holds {_FOLDER / 'Worlds'}"
+        raise MapError(str(folder), "folder", expected, "no such folder")
     if numbers is None:
         found = (re.fullmatch(r"(\d+)\.bmp", f.name) for f in (maps / "Worlds").iterdir())
         numbers = sorted(int(match[1]) for match in found if match)
