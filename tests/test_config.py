@@ -1,7 +1,7 @@
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import pytest
@@ -74,6 +74,7 @@ class Bounded:
 class Joined(Bounded):
     """Two of which belong together."""
 
+    GONE: ClassVar = {"number": "is now count"}
     inner: Bounded = Bounded()
 
     def check(self) -> None:
@@ -164,6 +165,11 @@ def test_values_out_of_bounds_are_refused_in_python_and_in_files(tmp_path, value
     text = text.replace("nan", ".nan")
     with pytest.raises(ConfigError, match=re.escape(f"inner: {message}")):
         config.load(Joined, write(tmp_path, text))
+
+
+def test_keys_of_earlier_versions_are_told_what_became_of_them(tmp_path):
+    with pytest.raises(ConfigError, match=r"task\.yaml: number: is now count"):
+        config.load(Joined, write(tmp_path, "number: 3"))
 
 
 def test_what_joins_fields_is_checked_after_bounds():

@@ -86,7 +86,8 @@ def settings(cls: type[T]) -> type[T]:
 
     Numbers have to lie within the `Bounds` of their annotations. Then the method `check`, if there
     is one, looks at what joins several fields, and raises `ValueError`. Values that are refused
-    raise `ConfigError`.
+    raise `ConfigError`. A class variable `GONE` says of keys of earlier versions what became of
+    them, for files that still have them.
     """
 
     def check_all(self: Any) -> None:
@@ -241,6 +242,8 @@ def _convert_dataclass(value: Any, cls: Any, field: str, base: Any = None) -> An
         raise _mismatch(value, cls, field)
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     for key in value:
+        if key in (gone := getattr(cls, "GONE", {})):
+            raise _MismatchError(f"{_join(field, key)}: {gone[key]}")
         if key not in fields:
             expected = choices(str(key), fields)
             raise _MismatchError(f"{_join(field, key)}: unknown key, expected {expected}")

@@ -41,6 +41,7 @@ from vertiwm_jax.rl.experiment import TrainConfig
 from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
 from vertiwm_jax.rl.planning import PlanningConfig
 from vertiwm_jax.rl.shooting import Shooting, ShootingConfig
+from vertiwm_jax.runs import Progress
 from vertiwm_jax.simulators import processes
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain.soil import PRESETS
@@ -202,7 +203,11 @@ def _predict(command: Prediction) -> None:
         "kinematic bicycle": (KinematicBicycle(), bicycle_of(driven)),
         "constant velocity": (ConstantVelocity(), None),
     }
-    predicted = {name: prediction.predict(*model, test) for name, model in models.items()}
+    predicted = {}
+    with Progress(len(models), "models") as progress:
+        for name, model in models.items():
+            predicted[name] = jax.block_until_ready(prediction.predict(*model, test))
+            progress.advance(1, f"{name}, {len(test):,} windows")
     rows = [
         [prediction.summary(name, found.states, test, steps) for name, found in predicted.items()]
         for steps in sorted(command.horizon)

@@ -1,6 +1,7 @@
 """What goal navigation asks, where an episode of it stands, and what all of them are run with."""
 
 import dataclasses
+from typing import ClassVar
 
 import jax
 import numpy as np
@@ -39,6 +40,8 @@ class NavigationConfig:
     route: how the way to the goal is found; it is straight where the map is not all known.
     reveal: what sensors reveal of a map that is not known; by default all of it is.
     """
+
+    GONE: ClassVar = {"chassis": "is gone; the sizes are those of the vehicle, see `vehicle`"}
 
     goal_radius: float = 8.0
     horizon_seconds: float = 60.0
