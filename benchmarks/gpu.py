@@ -43,7 +43,6 @@ from vertiwm_jax.env.suites import GroundConfig
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
-from vertiwm_jax.rl.loop import Seeds
 
 Found = dict[str, Any]
 Case = tuple[str, Callable[[], Found]]
@@ -95,7 +94,7 @@ class Benchmark:
     def learned(self, environments: int, **settings: Any) -> Job:
         """An iteration of PPO inside Verti-WM, with other settings."""
         ppo = replace(self.config.ppo, num_envs=environments, **settings)
-        algorithm = Seeds(replace(self.config, ppo=ppo).algorithm(self.task.env), 1)
+        algorithm = training.Seeds(replace(self.config, ppo=ppo).algorithm(self.task.env), 1)
         state = training.begin(algorithm, self.task.params, jax.random.key(0))
         return algorithm.iterate, (self.task.params, state)
 

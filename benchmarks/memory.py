@@ -14,7 +14,7 @@ from vertiwm_jax import machine, parallel, training
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
-from vertiwm_jax.rl.loop import Seeds
+from vertiwm_jax.training import Seeds
 
 _UNIT = 1 if sys.platform == "darwin" else 1024  # bytes, of `ru_maxrss`
 
@@ -40,9 +40,9 @@ def main() -> None:
     machine.forget_programs()
     dynamics, weights = experiment.dynamics(config, config.model)
     env = NavigationEnv(dynamics, config.navigation, config.variation)
-    algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
+    algorithm = Seeds(config.algorithm(env), config.loop.seeds)
     encoders = experiment.encoders(config)
-    training.compiled(algorithm, env.shapes(weights, terrain, pool, encoders), batch)
+    training.compiled(algorithm, env.shapes(weights, terrain, pool, encoders))
     results["compiled"] = {"most_MB": most()}
     params = jax.block_until_ready(env.make_params(weights, terrain, pool, encoders))
     results["worlds and starts"] = {
@@ -52,8 +52,9 @@ def main() -> None:
     }
     machine.forget_programs()
     state = training.begin(algorithm, params, config.key("training"))
-    iterate, mesh = training.compiled(algorithm, params, batch), parallel.mesh(batch)
-    params, state = parallel.place(mesh, (params, state))
+    iterate, mesh = training.compiled(algorithm, params), algorithm.mesh
+    params = parallel.place(mesh, params)
+    state = parallel.place(mesh, state, algorithm.specs)
     machine.release_memory()
     for _ in range(chosen.iterations):
         state, _ = iterate(params, state)

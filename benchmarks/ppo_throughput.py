@@ -27,8 +27,8 @@ from vertiwm_jax.models.config import Size
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
-from vertiwm_jax.rl.loop import Seeds
 from vertiwm_jax.rl.ppo import PPO
+from vertiwm_jax.training import Seeds
 from vertiwm_jax.world_model.network import ComputeDtype
 
 
@@ -59,9 +59,8 @@ def iteration(ppo: PPO, params: Any, repeat: int = 1) -> Figures:
     """On as many devices as a training has, and on one of them, with all cores to itself."""
     algorithm, results = Seeds(ppo, 1), {}
     start = jax.jit(algorithm.init)(params, jax.random.key(0))
-    for name, batch in (("", ppo.config.shareable), ("one_device_", 1)):
-        mesh = parallel.mesh(batch)
-        whole, state = parallel.place(mesh, (params, start))
+    for name, mesh in (("", algorithm.mesh), ("one_device_", parallel.mesh(1))):
+        whole, state = parallel.place(mesh, params), parallel.place(mesh, start, algorithm.specs)
         with jax.set_mesh(mesh):
             figures = measure(jax.jit(algorithm.iterate), whole, state, repeats=3)
         rate = repeat * ppo.config.collected / figures["median_s"]

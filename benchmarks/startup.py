@@ -45,7 +45,7 @@ def phases(name: str) -> dict[str, dict[str, float]]:
     from vertiwm_jax.env.navigation import NavigationEnv
     from vertiwm_jax.rl import experiment
     from vertiwm_jax.rl.experiment import PPOTraining
-    from vertiwm_jax.rl.loop import Seeds
+    from vertiwm_jax.training import Seeds
 
     lap("import")
     training.keep_compiled(None)  # in the folder of the environment
@@ -55,16 +55,17 @@ def phases(name: str) -> dict[str, dict[str, float]]:
     lap("worlds")
     dynamics, weights = experiment.dynamics(config, config.model)
     env = NavigationEnv(dynamics, config.navigation, config.variation)
-    algorithm, batch = Seeds(config.algorithm(env), config.loop.seeds), config.ppo.shareable
+    algorithm = Seeds(config.algorithm(env), config.loop.seeds)
     encoders = experiment.encoders(config)
-    training.compiled(algorithm, env.shapes(weights, terrain, pool, encoders), batch)
+    training.compiled(algorithm, env.shapes(weights, terrain, pool, encoders))
     lap("compile")
     params = jax.block_until_ready(env.make_params(weights, terrain, pool, encoders))
     machine.forget_programs()
     lap("starts")
     state = training.begin(algorithm, params, config.key("training"))
-    iterate = training.compiled(algorithm, params, batch)
-    params, state = parallel.place(parallel.mesh(batch), (params, state))
+    iterate = training.compiled(algorithm, params)
+    params = parallel.place(algorithm.mesh, params)
+    state = parallel.place(algorithm.mesh, state, algorithm.specs)
     lap("weights")
     jax.block_until_ready(iterate(params, state))
     lap(_LAST)

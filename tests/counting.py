@@ -1,8 +1,12 @@
 """The simplest algorithm that can be trained."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 from flax import struct
+
+from vertiwm_jax.training import Algorithm
 
 
 @struct.dataclass
@@ -10,7 +14,8 @@ class Counter:
     count: jax.Array
 
 
-class Counting:
+@dataclass(frozen=True)
+class Counting(Algorithm[Counter]):
     """It counts from its data; beyond a million it is lost."""
 
     def init(self, data, key):

@@ -50,11 +50,12 @@ def interrupt_at(monkeypatch, iteration, times, number=signal.SIGINT):
     monkeypatch.setattr(Run, "log", stopping)
 
 
-def test_metrics_checkpoints_progress_and_the_finished_state(new_run, capsys):
+def test_metrics_checkpoints_progress_and_the_finished_state(new_run, capsys, caplog):
+    caplog.set_level("INFO", "vertiwm_jax")
     run = new_run()
     state = go(run, 10)
     out = capsys.readouterr().out
-    assert "compiling for 1 of 2 devices ..." in out
+    assert "compiling for 1 of 2 devices ..." in caplog.messages
     assert "training 50/50" in out and "count 10" in out
     chex.assert_trees_all_equal(state, Counter(jnp.float32(11)))
     lines = runs.read_metrics(run.folder)

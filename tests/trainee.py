@@ -13,9 +13,9 @@ import jax
 from rl.probes import ProbeParams, Target
 
 from vertiwm_jax import cli
-from vertiwm_jax.rl.loop import LoopConfig, restore, train
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.runs import Run
+from vertiwm_jax.training import LoopConfig, Seeds, Work, restore, train
 
 STOPPED = 3
 """Iterations until the signal."""
@@ -36,11 +36,11 @@ def trained(folder: Path, iterations: int) -> Path:
     algorithm, data = PPO(Target(), CONFIG), ProbeParams()
     resume = folder if (folder / "checkpoints").is_dir() else None
     settings = Settings(folder, resume)
-    seeds = settings.loop.seeds
-    restored = restore(algorithm, data, resume, seeds) if resume else None
+    seeds = Seeds(algorithm, settings.loop.seeds)
+    restored = restore(seeds, data, resume) if resume else None
     with Run.begin(settings, "probe", restored[0] if restored else 0) as run:
-        key, steps, batch = jax.random.key(0), CONFIG.collected, CONFIG.shareable
-        train(algorithm, data, key, run, iterations, steps, batch, settings.loop, restored)
+        key, work = jax.random.key(0), Work("transitions", CONFIG.collected, ())
+        train(seeds, data, key, run, iterations, work, settings.loop, restored)
     return run.folder
 
 

@@ -17,21 +17,25 @@ from vertiwm_jax import hosts, machine
 
 T = TypeVar("T")
 
-AXIS = "devices"
-"""The axis of the mesh."""
-WHOLE, ROWS = PartitionSpec(), PartitionSpec(AXIS)
+SEEDS, BATCH = "seeds", "batch"
+"""The axes of a mesh: along one devices have seeds of their own, along the other they share."""
+WHOLE, ROWS = PartitionSpec(), PartitionSpec(BATCH)
 """Of arrays that every device has whole, and of those whose rows devices share."""
 FEWEST = 4
 """Rows of a batch that are worth a device of their own."""
 
 
-def mesh(batch: int) -> Mesh:
+def mesh(batch: int, seeds: int = 1) -> Mesh:
     """The devices for batches of this size: as many as divide it and have `FEWEST` rows or more.
 
     They are equally many of each host; where that cannot be, every host does all with its own.
+    Where all devices can have as many seeds, each has some with all rows of their batches.
     """
-    most, each = max(1, batch // FEWEST), jax.local_device_count()
+    each = jax.local_device_count()
     of_all = sorted(jax.devices(), key=lambda device: device.process_index)
+    if seeds > 1 and seeds % len(of_all) == 0:
+        return _mesh(np.reshape(of_all, (-1, 1)))
+    most = max(1, batch // FEWEST)
     together, alone = np.reshape(of_all, (-1, each)), np.reshape(jax.local_devices(), (1, each))
     even = next(
         by_host[:, :number]
@@ -39,36 +43,72 @@ def mesh(batch: int) -> Mesh:
         for number in range(each, 0, -1)
         if len(by_host) * number <= most and batch % (len(by_host) * number) == 0
     )
-    return Mesh(even.ravel(), (AXIS,), axis_types=(AxisType.Auto,))
+    return _mesh(np.reshape(even, (1, -1)))
 
 
 def number() -> int:
-    """Devices to share out to, here."""
+    """Devices to share batches out to, here."""
     around = jax.sharding.get_abstract_mesh()
-    return around.shape[AXIS] if AXIS in around.auto_axes else 1
+    return around.shape[BATCH] if BATCH in around.auto_axes else 1
 
 
-def place(mesh: Mesh, tree: T) -> T:
-    """A pytree of arrays, of which every device has a copy; of several hosts, the first one's."""
-    places = everywhere(mesh)
+def sharing() -> int:
+    """Devices that share this batch; for use inside of `shard`, and 1 elsewhere."""
+    around = jax.sharding.get_abstract_mesh()
+    return around.shape[BATCH] if BATCH in around.manual_axes else 1
+
+
+def total(tree: T) -> T:
+    """Sum over the devices that share a batch."""
+    return jax.lax.psum(tree, BATCH) if sharing() > 1 else tree
+
+
+def mean(tree: T) -> T:
+    """Mean over the devices that share a batch."""
+    # Leaf by leaf, which XLA sends together. As one vector, gradients of weights would be computed
+    # in the order of the vector, for which CPUs take longer (15 % of an update).
+    return jax.lax.pmean(tree, BATCH) if sharing() > 1 else tree
+
+
+def moments(x: jax.Array, axis: int | tuple[int, ...] | None = None) -> tuple[jax.Array, jax.Array]:
+    """Mean and variance along axes, of all devices that share a batch."""
+    middle = mean(jnp.mean(x, axis, keepdims=True))
+    variance = mean(jnp.mean((x - middle) ** 2, axis))
+    return middle.reshape(variance.shape), variance
+
+
+def place(mesh: Mesh, tree: T, specs: Any = WHOLE) -> T:
+    """A pytree of arrays on the devices; of several hosts, the first one's.
+
+    specs: how leaves are shared out, or a tree of that; every device has a copy by default.
+    """
     if not mesh.is_multi_process:
         if mesh.devices.flat[0].platform == "cpu":
             # All cores read one copy: JAX takes arrays of NumPy as they lie in memory.
             tree = hosts.with_keys(tree, jax.tree.map(np.asarray, hosts.without_keys(tree)))
-        return jax.device_put(tree, places)
+        return jax.device_put(tree, shardings(mesh, specs))
+
+    def put(place: NamedSharding, leaf: np.ndarray) -> jax.Array:
+        return jax.make_array_from_callback(leaf.shape, place, lambda index: leaf[index])
+
     sent = hosts.of_first(hosts.without_keys(tree))
-    placed = jax.tree.map(partial(jax.make_array_from_process_local_data, places), sent)
-    return hosts.with_keys(tree, placed)
+    every = jax.tree.broadcast(shardings(mesh, specs), sent)
+    return hosts.with_keys(tree, jax.tree.map(put, every, sent))
 
 
-def everywhere(mesh: Mesh) -> NamedSharding:
-    """The place of what every device has a copy of."""
-    return NamedSharding(mesh, WHOLE)
+def shardings(mesh: Mesh, specs: Any = WHOLE) -> Any:
+    """The places of leaves on a mesh."""
+    return jax.tree.map(partial(NamedSharding, mesh), specs, is_leaf=_is_spec)
+
+
+def with_axis(name: str, specs: Any) -> Any:
+    """How leaves are shared out that have one more axis, the first, which devices share too."""
+    return jax.tree.map(lambda spec: PartitionSpec(name, *spec), specs, is_leaf=_is_spec)
 
 
 def gather(mesh: Mesh, tree: T) -> T:
     """Whole arrays on this host's first device; their types know of no mesh."""
-    put = jax.device_put(tree, everywhere(mesh)) if mesh.is_multi_process else place(mesh, tree)
+    put = jax.device_put(tree, shardings(mesh)) if mesh.is_multi_process else place(mesh, tree)
     return jax.tree.map(lambda leaf: leaf.addressable_data(0), put)
 
 
@@ -78,9 +118,9 @@ def shard(function: Callable[..., T], in_specs: Sequence[Any], out_specs: Any) -
     in_specs: how the leaves of each argument are shared out, or trees of that. All arrays must be
         arguments: what a function closes over is not on the device.
     """
-    if number() == 1:
-        return function
     mesh, in_specs = jax.sharding.get_abstract_mesh(), tuple(in_specs)
+    if BATCH not in mesh.auto_axes or mesh.size == 1:
+        return function
 
     def on_mesh(*args: Any) -> T:
         # Arrays without elements are made where they are used: as operands of `shard_map` they end
@@ -214,6 +254,11 @@ def whole(tree: T) -> T:
 
 def _placed(tree: T, places: PartitionSpec) -> T:
     return jax.lax.with_sharding_constraint(tree, places) if number() > 1 else tree
+
+
+def _mesh(devices: np.ndarray) -> Mesh:
+    """Of devices `[seeds, batch]`."""
+    return Mesh(devices, (SEEDS, BATCH), axis_types=(AxisType.Auto, AxisType.Auto))
 
 
 def _is_spec(leaf: Any) -> bool:

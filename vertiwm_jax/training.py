@@ -1,15 +1,16 @@
 """The host loop of training: progress, metrics and checkpoints around a compiled algorithm."""
 
 import contextlib
-import functools
 import logging
 import signal
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,16 +27,63 @@ State = TypeVar("State")
 _log = logging.getLogger(__name__)
 
 
-class Algorithm(Protocol[State]):
+class Algorithm(ABC, Generic[State]):
     """A learning algorithm: two pure functions, compiled whole; `data` is what it learns from.
 
-    `iterate` gives scalar metrics, or arrays of them whose mean is reported; NaN is no value. Its
-    `finite` says whether training can go on.
+    specs: how devices share out the leaves of the state; every device has all by default.
     """
 
-    def init(self, data: Any, key: jax.Array, /) -> State: ...
+    specs: ClassVar[Any] = parallel.WHOLE
 
-    def iterate(self, data: Any, state: State, /) -> tuple[State, dict[str, jax.Array]]: ...
+    @property
+    def batch(self) -> int:
+        """What divides the sizes of all batches that devices share; 1 for none."""
+        return 1
+
+    @property
+    def mesh(self) -> Mesh:
+        """The devices that it is worth while to use."""
+        return parallel.mesh(self.batch)
+
+    @abstractmethod
+    def init(self, data: Any, key: jax.Array) -> State:
+        """The state before the first iteration."""
+
+    @abstractmethod
+    def iterate(self, data: Any, state: State) -> tuple[State, dict[str, jax.Array]]:
+        """The state after an iteration, and scalar metrics, or arrays whose mean is reported.
+
+        NaN is no value. `finite` says whether training can go on.
+        """
+
+
+@dataclass(frozen=True)
+class Seeds(Algorithm[State]):
+    """An algorithm with several random keys; every leaf of its state has an axis of seeds."""
+
+    algorithm: Algorithm[State]
+    seeds: int
+
+    @property
+    def specs(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return parallel.with_axis(parallel.SEEDS, self.algorithm.specs)
+
+    @property
+    def mesh(self) -> Mesh:
+        return parallel.mesh(self.algorithm.batch, self.seeds)
+
+    def init(self, data: Any, key: jax.Array) -> State:
+        keys = jax.random.split(key, self.seeds)
+        # One after the other: batched QR decompositions, of which orthogonal weights are made, wait
+        # for each other for ever on a CPU of few cores (jaxlib 0.10).
+        return jax.lax.map(partial(self.algorithm.init, data), keys)
+
+    def iterate(self, data: Any, state: State) -> tuple[State, dict[str, jax.Array]]:
+        if self.seeds == 1:  # an axis of one makes XLA compile slower sums
+            alone = jax.tree.map(lambda x: x[0], state)
+            return jax.tree.map(lambda x: x[None], self.algorithm.iterate(data, alone))
+        iterate = jax.vmap(self.algorithm.iterate, (None, 0), spmd_axis_name=parallel.SEEDS)
+        return iterate(data, state)
 
 
 @settings
@@ -48,17 +96,21 @@ class CheckpointConfig:
     """Newest checkpoints that are kept."""
 
 
+@settings
+class LoopConfig(CheckpointConfig):
+    """What is kept of a training, and how often it is done."""
+
+    seeds: Count = 1
+    """Trainings with different random keys, run side by side."""
+
+
 @dataclass(frozen=True)
 class Work:
-    """What an iteration gets done, for rates and metrics, and which metrics the progress shows.
-
-    batch: what divides the sizes of all batches that are shared out to devices; 1 for none.
-    """
+    """What an iteration gets done, for rates and metrics, and which metrics the progress shows."""
 
     unit: str
     amount: int
     shown: tuple[str, ...]
-    batch: int = 1
 
 
 class TrainingError(UserError):
@@ -109,8 +161,8 @@ def restore(algorithm: Algorithm[State], data: Any, folder: Path) -> tuple[int, 
     return int(checkpoint.name), checkpoints.load(checkpoint, like)
 
 
-def compiled(algorithm: Algorithm[State], data: Any, batch: int) -> Any:
-    """`iterate` as a program for the devices of `Work.batch`; the last one is kept.
+def compiled(algorithm: Algorithm[State], data: Any) -> Any:
+    """`iterate` as a program for the devices of `algorithm.mesh`; the last one is kept.
 
     data: arrays or shapes of them. To compile takes much memory, which may be there only before
     the data are. Trainings that are alike, like those of gates, have one program.
@@ -118,7 +170,7 @@ def compiled(algorithm: Algorithm[State], data: Any, batch: int) -> Any:
     kinds = jax.eval_shape(lambda x: (x, algorithm.init(x, jax.random.key(0))), data)
     leaves, kind = jax.tree.flatten(kinds)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-    return _compiled(algorithm, parallel.mesh(batch), kind, shapes)
+    return _compiled(algorithm, algorithm.mesh, kind, shapes)
 
 
 def begin(algorithm: Algorithm[State], data: Any, key: jax.Array) -> State:
@@ -152,12 +204,18 @@ def train(
     if done >= iterations:
         return state
 
-    iterate = compiled(algorithm, data, work.batch)
-    # Between iterations every device has all, so that checkpoints do not know of devices.
-    mesh = parallel.mesh(work.batch)
-    data, state = parallel.place(mesh, (data, state))
+    iterate, mesh = compiled(algorithm, data), algorithm.mesh
+    data = parallel.place(mesh, data)
+    state = parallel.place(mesh, state, algorithm.specs)
     machine.release_memory()
     total = (iterations - done) * work.amount
+
+    def save() -> None:
+        # Whole arrays, so that checkpoints do not know of devices.
+        whole = parallel.gather(mesh, state)
+        checkpoints.save(folder, done, whole, config.keep)
+        saved(whole)
+
     with _interruptible() as interrupted, run.progress(total, "training") as progress:
         while done < iterations and not hosts.on_any(bool(interrupted)):
             start = time.perf_counter()
@@ -175,11 +233,9 @@ def train(
             shown = (f"{name} {scalars[name]:.4g}" for name in work.shown if name in scalars)
             progress.advance(work.amount, "  ".join(shown))
             if done % config.checkpoint_every == 0:
-                checkpoints.save(folder, done, state, config.keep)
-                saved(state)
+                save()
         if done % config.checkpoint_every:
-            checkpoints.save(folder, done, state, config.keep)
-            saved(state)
+            save()
     if done < iterations:
         raise TrainingInterrupted(
             f"stopped after iteration {done} of {iterations}, all saved; "
@@ -188,15 +244,18 @@ def train(
     return parallel.gather(mesh, state)
 
 
-@functools.lru_cache(maxsize=1)
+@lru_cache(maxsize=1)
 def _compiled(algorithm: Algorithm[Any], mesh: Mesh, kind: Any, shapes: tuple[Any, ...]) -> Any:
     """For data and state of a kind of pytree with leaves of these shapes and types."""
     _log.info("compiling for %d of %d devices ...", mesh.size, jax.device_count())
-    start, place = time.perf_counter(), parallel.everywhere(mesh)
-    leaves = [jax.ShapeDtypeStruct(*shape, sharding=place) for shape in shapes]
-    iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=place)
+    start, whole = time.perf_counter(), parallel.shardings(mesh)
+    shared = parallel.shardings(mesh, algorithm.specs)
+    kinds = jax.tree.unflatten(kind, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    places = jax.tree.broadcast((whole, shared), kinds)
+    given = jax.tree.map(lambda x, place: x.update(sharding=place), kinds, places)
+    iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=(shared, whole))
     with jax.set_mesh(mesh):
-        done = iterate.lower(*jax.tree.unflatten(kind, leaves)).compile()
+        done = iterate.lower(*given).compile()
     machine.release_memory()
     _log.info("compiled in %.0f s", time.perf_counter() - start)
     return done

@@ -237,7 +237,7 @@ def test_a_model_is_traced_once_for_starts_and_for_steps(name, monkeypatch):
     mesh = parallel.mesh(number)
     keys, actions = jax.random.split(KEY, number), jnp.zeros((number, 2))
     given = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=parallel.everywhere(mesh)),
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=parallel.shardings(mesh)),
         (keys, shapes.starts, actions, shapes),
     )
     with jax.set_mesh(mesh):

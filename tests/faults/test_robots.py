@@ -16,7 +16,7 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.networks.policy import Actor, Senses
 from vertiwm_jax.rl.learned import Corrected, MeanAction
-from vertiwm_jax.rl.normalise import RunningStatistics
+from vertiwm_jax.rl.running_statistics import RunningStatistics
 
 CONFIG = NavigationConfig()
 

@@ -21,10 +21,10 @@ from vertiwm_jax.learning.objectives import RolloutLoss
 from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.rl.loop import Seeds
 from vertiwm_jax.rl.off_policy import OffPolicy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
+from vertiwm_jax.training import Seeds
 
 OPEN = Path(__file__).parents[2] / "data" / "open"
 
@@ -174,10 +174,12 @@ ALGORITHMS = {
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-@pytest.mark.parametrize("seeds", [1, 2])
-def test_training_on_two_devices_is_training_on_one(two, name, seeds):
+@pytest.mark.parametrize(("seeds", "apart"), [(1, 1), (2, 1), (2, 2)])
+def test_training_on_two_devices_is_training_on_one(name, seeds, apart):
     algorithm = Seeds(ALGORITHMS[name], seeds)
-    assert algorithm.algorithm.config.shareable == 16
+    two = parallel.mesh(16, apart)
+    assert dict(two.shape) == {"seeds": apart, "batch": 2 // apart}
+    assert algorithm.algorithm.batch == 16
     params = ProbeParams(max_steps_in_episode=20)
     start = jax.jit(algorithm.init)(params, jax.random.key(0))
 

@@ -167,7 +167,10 @@ def test_what_is_set_beside_resume_is_kept(run, train, tmp_path):
     [
         ("ppo: {learnin_rate: 1}", "ppo.learnin_rate: unknown key, expected one of"),
         ("ppo: {epochs: many}", "ppo.epochs: expected int, found 'many' (str)"),
-        ("ppo: {minibatches: 7}", "ppo: minibatches: 7 does not divide"),
+        (
+            "ppo: {minibatches: 7}",
+            "ppo: minibatches: expected minibatches * accumulate, 7, to",
+        ),
         ("loop: {seeds: 0}", "loop: seeds: expected at least 1, found 0"),
     ],
 )

@@ -29,7 +29,7 @@ from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.rl.experiment import SACTraining
 from vertiwm_jax.rl.learned import Corrected, MeanAction
-from vertiwm_jax.rl.normalise import RunningStatistics
+from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.reveal import RevealConfig

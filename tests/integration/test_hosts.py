@@ -70,7 +70,7 @@ def learned(run):
     """Metrics of all iterations, and weights at the end."""
     lines = numbers(run)
     algorithm, data = trainee.PPO(trainee.Target(), trainee.CONFIG), trainee.ProbeParams()
-    restored = trainee.restore(algorithm, data, run, 1)
+    restored = trainee.restore(trainee.Seeds(algorithm, 1), data, run)
     assert restored is not None and restored[0] == len(lines) == ITERATIONS
     return lines, restored[1].params
 

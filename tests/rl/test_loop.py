@@ -9,10 +9,17 @@ from counting import Counting
 from rl.probes import Broken, ProbeParams, Target
 
 from vertiwm_jax import checkpoints, runs
-from vertiwm_jax.rl.loop import LoopConfig, restore, train
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.runs import Run
-from vertiwm_jax.training import TrainingError, TrainingInterrupted
+from vertiwm_jax.training import (
+    LoopConfig,
+    Seeds,
+    TrainingError,
+    TrainingInterrupted,
+    Work,
+    restore,
+    train,
+)
 
 CONFIG = PPOConfig(
     transitions=6 * 32, num_envs=4, num_steps=8, minibatches=2, epochs=2, hidden=(8,)
@@ -26,9 +33,10 @@ def new_run(tmp_path):
 
 def go(algorithm, run, iterations, env_params=ProbeParams(), **config):
     config = LoopConfig(**{"seeds": 2, "checkpoint_every": 4, **config})
-    restored = restore(algorithm, env_params, run.folder, config.seeds)
-    key, batch = jax.random.key(0), CONFIG.shareable
-    return train(algorithm, env_params, key, run, iterations, 32, batch, config, restored)
+    seeds = Seeds(algorithm, config.seeds)
+    restored = restore(seeds, env_params, run.folder)
+    work = Work("transitions", 32 * config.seeds, ())
+    return train(seeds, env_params, jax.random.key(0), run, iterations, work, config, restored)
 
 
 def interrupt_at(monkeypatch, iteration):
@@ -63,10 +71,11 @@ def test_resumed_training_ends_with_the_same_bits(new_run, monkeypatch):
     assert len(numbers(stopped_run)) == 6
 
 
-def test_metrics_checkpoints_and_the_finished_state(new_run, capsys):
+def test_metrics_checkpoints_and_the_finished_state(new_run, caplog):
+    caplog.set_level("INFO", "vertiwm_jax")
     run = new_run()
     state = go(Counting(), run, 10, jnp.float32(1), keep=2)
-    assert "compiling for 1 of 2 devices ..." in capsys.readouterr().out
+    assert "compiling for 2 of 2 devices ..." in caplog.messages
     chex.assert_trees_all_equal(state.count, jnp.full(2, 11.0))
     lines = runs.read_metrics(run.folder)
     assert [line["count"] for line in lines] == list(range(1, 11))

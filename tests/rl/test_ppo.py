@@ -146,18 +146,20 @@ def test_learning_rate_halfway(schedule, share):
     )
 
 
-def test_minibatches_must_divide_the_batch():
-    with pytest.raises(ValueError, match="minibatches: 7 does not divide"):
-        PPOConfig(num_envs=4, num_steps=4, minibatches=7)
+@pytest.mark.parametrize(("minibatches", "parts"), [(7, 1), (2, 3), (16, 2)])
+def test_minibatches_and_their_parts_must_divide_the_steps(minibatches, parts):
+    with pytest.raises(
+        ValueError, match=f"accumulate, {minibatches * parts}, to divide num_steps, 16"
+    ):
+        PPOConfig(num_envs=4, num_steps=16, minibatches=minibatches, accumulate=parts)
 
 
 def test_an_epoch_learns_from_every_transition_once():
     def mean_loss(minibatches):
-        config = PPOConfig(**{**vars(CONFIG), "learning_rate": 0.0, "minibatches": minibatches})
+        config = PPOConfig(**{**vars(CONFIG), "learning_rate": 1e-12, "minibatches": minibatches})
         return float(train(PPO(Target(), config), iterations=1)[1]["value_loss"])
 
-    # By 16 groups of one environment, then by groups of two and of four.
-    losses = [mean_loss(minibatches) for minibatches in (1, 2, 32, 64)]
+    losses = [mean_loss(minibatches) for minibatches in (1, 2, 4, 16)]
     np.testing.assert_allclose(losses, losses[0], rtol=1e-5)
 
 
@@ -179,14 +181,6 @@ def test_what_is_learned_from_is_what_was_seen():
     assert abs(metrics["kl"]) < 1e-6
     actions = ppo.policy(ProbeParams(), state)(Pictured.pictured(jnp.array([[-1.0], [1.0]])))
     assert np.ptp(actions) > 0.1
-
-
-@pytest.mark.parametrize(
-    ("parts", "expected"), [(0, "at least 1"), (3, "a divisor of .* 128"), (256, "a divisor of")]
-)
-def test_parts_must_divide_the_minibatch(parts, expected):
-    with pytest.raises(ValueError, match=f"accumulate: expected {expected}.*, found {parts}"):
-        PPOConfig(**{**vars(CONFIG), "accumulate": parts})
 
 
 def test_entropy_weight_widens_the_policy():

@@ -16,7 +16,7 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.traversability import TraversabilityCost
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.networks.policy import SquashedActor
-from vertiwm_jax.rl import normalise
+from vertiwm_jax.rl import running_statistics
 from vertiwm_jax.rl.learned import Corrected, MeanAction
 from vertiwm_jax.state import STEP_SECONDS, Command
 from vertiwm_jax.terrain.classes import STANDARD
@@ -59,7 +59,7 @@ def about(
         },
         "arcs": {"steering": ARC_STEERING.tolist(), "stations": ARC_STATIONS.tolist()},
         "network": {
-            "normalised_limit": normalise.CLIP,
+            "normalised_limit": running_statistics.CLIP,
             "embedding": image,
             "squashed": isinstance(_learned(policy).actor, SquashedActor),
         },

@@ -17,7 +17,7 @@ from vertiwm_jax import checkpoints, training
 from vertiwm_jax.config import ConfigError, Count, CountOrZero, NotNegative, Positive, settings
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.runs import Run
-from vertiwm_jax.training import CheckpointConfig, Work
+from vertiwm_jax.training import Algorithm, CheckpointConfig, Work
 
 RESULT = "fitted"
 """Folder in that of the run that holds the parameters a fit ended with."""
@@ -109,15 +109,19 @@ class FitState:
 
 
 @dataclass(frozen=True)
-class Fit:
-    """The `training.Algorithm` that fits a problem; `FitInputs` is what it learns from."""
+class Fit(Algorithm[FitState]):
+    """The algorithm that fits a problem; `FitInputs` is what it learns from."""
 
     problem: Problem
     config: FitConfig
 
-    def init(self, inputs: FitInputs, key: jax.Array) -> FitState:
+    @property
+    def batch(self) -> int:
+        return self.problem.batch
+
+    def init(self, data: FitInputs, key: jax.Array) -> FitState:
         """The beginning; `ConfigError` if `trainable` names what the parameters do not have."""
-        trained = _pick(inputs.params, self.config.trainable)
+        trained = _pick(data.params, self.config.trainable)
         return FitState(
             trained=jax.tree.map(partial(jnp.array, copy=True), trained),
             optimiser=self._optimiser.init(trained),
@@ -127,19 +131,19 @@ class Fit:
             best_error=jnp.float32(jnp.inf),
         )
 
-    def iterate(self, inputs: FitInputs, state: FitState) -> tuple[FitState, dict[str, jax.Array]]:
+    def iterate(self, data: FitInputs, state: FitState) -> tuple[FitState, dict[str, jax.Array]]:
         """`updates_per_iteration` updates and a validation.
 
         An update whose gradients are not finite is skipped. Metrics are means over the updates,
         the share that was `skipped`, and those of the validation.
         """
         state, metrics = jax.lax.scan(
-            lambda state, _: self._update(inputs, state),
+            lambda state, _: self._update(data, state),
             state,
             length=self.config.updates_per_iteration,
         )
-        params = merge(inputs.params, state.trained)
-        validated = self.problem.validate(params, inputs.data)
+        params = merge(data.params, state.trained)
+        validated = self.problem.validate(params, data.data)
         error = validated["error"]
         better = error < state.best_error
         best = jax.tree.map(partial(jnp.where, better), state.trained, state.best)
@@ -209,7 +213,7 @@ def fit(
         key,
         run,
         config.updates // config.updates_per_iteration,
-        Work("updates", config.updates_per_iteration, ("loss", "error"), problem.batch),
+        Work("updates", config.updates_per_iteration, ("loss", "error")),
         config.checkpoints,
         restored,
     )

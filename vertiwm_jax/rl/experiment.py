@@ -4,12 +4,12 @@ import logging
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol, cast
+from typing import Any, ClassVar, Literal, cast
 
 import jax
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import machine
+from vertiwm_jax import machine, training
 from vertiwm_jax.config import ConfigError, Count
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import controllers, suites, tasks
@@ -26,36 +26,22 @@ from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
 from vertiwm_jax.models.registry import Imagined, ModelName, load_encoders, load_model
 from vertiwm_jax.perception.features import Encoders
-from vertiwm_jax.rl import loop, policy
-from vertiwm_jax.rl.learned import MeanAction, TwinValue, Value
-from vertiwm_jax.rl.loop import LoopConfig
+from vertiwm_jax.rl import policy
+from vertiwm_jax.rl.algorithm import LearningConfig, PolicyAlgorithm
 from vertiwm_jax.rl.off_policy import OffPolicy
 from vertiwm_jax.rl.planning import Planner, PlanningConfig
 from vertiwm_jax.rl.policy import Base, PolicyConfig, load_policy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
-from vertiwm_jax.rl.settings import LearningConfig
 from vertiwm_jax.rl.td3 import TD3, TD3Config
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.training import Algorithm, keep_compiled
+from vertiwm_jax.training import LoopConfig, Seeds, Work, keep_compiled
 from vertiwm_jax.world_model.network import ComputeDtype
 
 Rows = dict[str, Policy | Agent]
 """Policies by their names in tables."""
 _log = logging.getLogger(__name__)
-
-
-class Learning(Algorithm[Any], Protocol):
-    """An algorithm that learns a policy from environments."""
-
-    def policy(self, env_params: TaskParams, state: Any, /) -> MeanAction:
-        """What `state` has learned."""
-        ...
-
-    def value(self, env_params: TaskParams, state: Any, /) -> Value | TwinValue:
-        """What `state` expects of its policy."""
-        ...
 
 
 @configuration.settings
@@ -141,7 +127,7 @@ class TrainConfig(TaskConfig, ABC):
         return getattr(self, self.name)
 
     @abstractmethod
-    def algorithm(self, env: NavigationEnv) -> Learning:
+    def algorithm(self, env: NavigationEnv) -> PolicyAlgorithm[Any]:
         """The algorithm on the task, as configured."""
 
     @property
@@ -344,12 +330,12 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
     env = NavigationEnv(moves, config.navigation, config.variation)
     driven = config.driven.vehicle, encoders(config)
     shapes = env.shapes(weights, terrain, pool, *driven)
-    algorithm, schedule, seeds = config.algorithm(env), config.schedule, config.loop.seeds
-    steps = schedule.collected * config.action_repeat
-    restored = loop.restore(algorithm, shapes, config.resume, seeds) if config.resume else None
+    algorithm, schedule = config.algorithm(env), config.schedule
+    seeds = Seeds(algorithm, config.loop.seeds)
+    restored = training.restore(seeds, shapes, config.resume) if config.resume else None
     if not restored or restored[0] < schedule.iterations:
         # Now, while there are no vehicles yet that fill the memory.
-        loop.prepare(algorithm, shapes, seeds, schedule.shareable)
+        training.compiled(seeds, shapes)
     _log.info("placing vehicles for %s tasks ...", f"{len(pool.world):,}")
     params = env.make_params(weights, terrain, pool, *driven)
     machine.forget_programs()
@@ -362,17 +348,11 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
             learned = algorithm.policy(params, state), algorithm.value(params, state)
             policy.save(begun.folder / policy.FOLDER, config.of_policy, *learned)
 
-        state = loop.train(
-            algorithm,
-            params,
-            config.key("training"),
-            begun,
-            schedule.iterations,
-            steps,
-            schedule.shareable,
-            config.loop,
-            restored,
-            keep,
+        steps = schedule.collected * config.action_repeat * config.loop.seeds
+        work = Work("transitions", steps, ("episode_return", "success"))
+        key, iterations = config.key("training"), schedule.iterations
+        state = training.train(
+            seeds, params, key, begun, iterations, work, config.loop, restored, keep
         )
         keep(state)
     return Trained(config, begun.folder, held_out, given is not None)

@@ -16,7 +16,7 @@ from vertiwm_jax.networks.policy import (
     SquashedActor,
     twin_values,
 )
-from vertiwm_jax.rl.normalise import RunningStatistics
+from vertiwm_jax.rl.running_statistics import RunningStatistics
 
 
 @struct.dataclass

@@ -17,12 +17,12 @@ from gymnax.environments.environment import Environment
 from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, NotNegative, Share, settings
 from vertiwm_jax.networks.policy import ActionCritic, Senses, SquashedActor, twin_values
-from vertiwm_jax.rl import environments
-from vertiwm_jax.rl.environments import Environments, Experience, Metrics, Outcomes
+from vertiwm_jax.rl import collect
+from vertiwm_jax.rl.algorithm import LearningConfig, PolicyAlgorithm
+from vertiwm_jax.rl.collect import Environments, Metrics, Outcomes, Steps
 from vertiwm_jax.rl.learned import MeanAction, TwinValue
-from vertiwm_jax.rl.normalise import RunningStatistics
 from vertiwm_jax.rl.replay import Replay
-from vertiwm_jax.rl.settings import LearningConfig
+from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.training import all_finite
 
 Params = Any
@@ -191,7 +191,7 @@ class OffPolicyState(Generic[Learner]):
 
 
 @dataclass(frozen=True)
-class OffPolicy(Generic[Learner]):
+class OffPolicy(PolicyAlgorithm[OffPolicyState[Learner]], Generic[Learner]):
     """A rule on a gymnax environment with a flat observation and a bounded Box of actions.
 
     env: static; its parameters are an argument of every function.
@@ -209,12 +209,16 @@ class OffPolicy(Generic[Learner]):
         """The rule's settings."""
         return self.rule.config
 
-    def init(self, env_params: Params, key: jax.Array) -> OffPolicyState[Learner]:
+    @property
+    def batch(self) -> int:
+        return self.config.shareable
+
+    def init(self, data: Params, key: jax.Array) -> OffPolicyState[Learner]:
         """The state before the first iteration."""
         key, reset_key, learner_key = jax.random.split(key, 3)
-        running = environments.start(self.env, env_params, self.config.num_envs, reset_key)
+        running = collect.start(self.env, data, self.config.num_envs, reset_key)
         observation = running.observation[0]
-        networks = self._networks(env_params)
+        networks = self._networks(data)
         row = Remembered(
             observation=observation,
             following=observation,
@@ -233,7 +237,7 @@ class OffPolicy(Generic[Learner]):
         )
 
     def iterate(
-        self, env_params: Params, state: OffPolicyState[Learner]
+        self, data: Params, state: OffPolicyState[Learner]
     ) -> tuple[OffPolicyState[Learner], Metrics]:
         """`num_steps` steps of all environments, each with its gradient steps; jit it, donated.
 
@@ -245,37 +249,37 @@ class OffPolicy(Generic[Learner]):
 
         def advance(
             state: OffPolicyState[Learner], key: jax.Array
-        ) -> tuple[OffPolicyState[Learner], tuple[Experience, Metrics]]:
+        ) -> tuple[OffPolicyState[Learner], tuple[Steps, Metrics]]:
             collect_key, learn_key = jax.random.split(key)
             with jax.named_scope("collect"):
-                state, experience = self._collect(env_params, state, collect_key)
+                state, experience = self._collect(data, state, collect_key)
             with jax.named_scope("update"):
-                state, losses = self._learn(env_params, state, learn_key)
+                state, losses = self._learn(data, state, learn_key)
             return state, (experience, losses)
 
         state, (experience, losses) = jax.lax.scan(advance, state, keys)
         metrics = {
             **jax.tree.map(jnp.nanmean, losses),
-            **environments.episodes(experience),
+            **collect.episode_metrics(experience),
             "reward": jnp.mean(experience.reward),
             "finite": all_finite(state.learner),
         }
         return replace(state, iteration=state.iteration + 1, key=key), metrics
 
-    def policy(self, env_params: Params, state: OffPolicyState[Learner]) -> MeanAction:
+    def policy(self, data: Params, state: OffPolicyState[Learner]) -> MeanAction:
         """What `state` has learned."""
-        actor = self._networks(env_params).actor
+        actor = self._networks(data).actor
         return MeanAction(actor, state.learner.averaged, state.observations)
 
-    def value(self, env_params: Params, state: OffPolicyState[Learner]) -> TwinValue:
+    def value(self, data: Params, state: OffPolicyState[Learner]) -> TwinValue:
         """What `state` expects of its policy."""
-        critic = self._networks(env_params).critic
-        policy, scale = self.policy(env_params, state), state.returns.std
+        critic = self._networks(data).critic
+        policy, scale = self.policy(data, state), state.returns.std
         return TwinValue(critic, state.learner.critics, policy, scale)
 
-    def _networks(self, env_params: Params) -> Networks:
+    def _networks(self, data: Params) -> Networks:
         config = self.config
-        actions = math.prod(self.env.action_space(env_params).shape)
+        actions = math.prod(self.env.action_space(data).shape)
         return Networks(
             self.rule.actor(actions, self.senses),
             ActionCritic(config.hidden, self.senses),
@@ -288,18 +292,19 @@ class OffPolicy(Generic[Learner]):
         return state.replay.filled < self.config.warm_up
 
     def _collect(
-        self, env_params: Params, state: OffPolicyState[Learner], key: jax.Array
-    ) -> tuple[OffPolicyState[Learner], Experience]:
+        self, data: Params, state: OffPolicyState[Learner], key: jax.Array
+    ) -> tuple[OffPolicyState[Learner], Steps]:
         """A step of all environments, remembered."""
         explore_key, random_key, step_key = jax.random.split(key, 3)
         running, config = state.environments, self.config
-        networks = self._networks(env_params)
+        networks = self._networks(data)
         seen = state.observations.normalise(running.observation)
         chosen = self.rule.explore(networks, state.learner, seen, explore_key)
         anything = jax.random.uniform(random_key, chosen.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(self._warming_up(state), anything, chosen)
-        running, experience, following = environments.step(
-            self.env, env_params, self.outcomes, config.discount, running, action, step_key
+        keys = jax.random.split(step_key, config.num_envs)
+        running, experience, following = collect.step(
+            self.env, data, self.outcomes, config.discount, running, action, keys
         )
         rows = Remembered(
             observation=experience.observation,
@@ -322,10 +327,10 @@ class OffPolicy(Generic[Learner]):
         ), experience
 
     def _learn(
-        self, env_params: Params, state: OffPolicyState[Learner], key: jax.Array
+        self, data: Params, state: OffPolicyState[Learner], key: jax.Array
     ) -> tuple[OffPolicyState[Learner], Metrics]:
         """`updates` gradient steps, none while warming up; the metrics are means."""
-        networks = self._networks(env_params)
+        networks = self._networks(data)
 
         def update(learner: Learner, key: jax.Array) -> tuple[Learner, Metrics]:
             sample_key, learn_key = jax.random.split(key)

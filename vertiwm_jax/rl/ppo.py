@@ -1,33 +1,37 @@
 """Proximal policy optimisation, collection and update in one compiled program.
 
-Schulman et al. (2017), with the details of Andrychowicz et al. (2021). An algorithm is a frozen
-object with two pure functions, `init` and `iterate`, over one `TrainState`; several seeds are a
-`vmap` of both.
+Schulman et al. (2017), with the details of Andrychowicz et al. (2021). It is written for one
+device. Where a mesh is in context, each device does this with its share of the environments, and
+they exchange gradients and statistics (`parallel.mean`).
 """
 
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, cast
+from typing import Any, ClassVar, Literal, cast
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
 from gymnax.environments.environment import Environment
+from jax.sharding import PartitionSpec
 
 from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, NotNegative, Positive, Share, settings
 from vertiwm_jax.networks.policy import Actor, Critic, Gaussian, Senses
-from vertiwm_jax.rl import environments
-from vertiwm_jax.rl.advantages import generalised_advantages
-from vertiwm_jax.rl.environments import Environments, Experience, Metrics, Outcomes
+from vertiwm_jax.parallel import BATCH, ROWS, WHOLE
+from vertiwm_jax.rl import collect
+from vertiwm_jax.rl.algorithm import LearningConfig, PolicyAlgorithm
+from vertiwm_jax.rl.collect import Environments, Metrics, Outcomes, Steps
+from vertiwm_jax.rl.gae import gae
 from vertiwm_jax.rl.learned import MeanAction, Value
-from vertiwm_jax.rl.normalise import RunningStatistics
-from vertiwm_jax.rl.settings import LearningConfig
+from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.training import all_finite, mean_in_turns
 
 Params = Any
+_BY_ENVIRONMENT = PartitionSpec(None, BATCH)
+"""Of arrays `[T, N, ...]`, of which each device has some of N."""
 
 
 @settings
@@ -39,7 +43,7 @@ class PPOConfig(LearningConfig):
     epochs: Count = 6
     """Passes over the data of an iteration."""
     minibatches: Count = 8
-    """Gradient steps in a pass; divides num_envs * num_steps."""
+    """Gradient steps in a pass, each from as many steps of every environment; divides num_steps."""
     accumulate: Count = 1
     """Parts of a minibatch whose gradients are computed one after the other, for less memory."""
     trace: Share = 0.95
@@ -56,26 +60,13 @@ class PPOConfig(LearningConfig):
     """Weight of the entropy bonus."""
 
     def check(self):
-        if self.collected % self.minibatches:
-            divisor = math.gcd(self.minibatches, self.collected)
+        parts = self.minibatches * self.accumulate
+        if self.num_steps % parts:
+            divisor = math.gcd(parts, self.num_steps)
             raise ValueError(
-                f"minibatches: {self.minibatches} does not divide num_envs * num_steps = "
-                f"{self.collected}; choose a divisor, for example {divisor}"
+                f"minibatches: expected minibatches * accumulate, {parts}, to divide num_steps, "
+                f"{self.num_steps}; choose a divisor, for example {divisor}"
             )
-        if self.minibatch % self.accumulate:
-            raise ValueError(
-                f"accumulate: expected a divisor of num_envs * num_steps / minibatches = "
-                f"{self.minibatch}, found {self.accumulate}"
-            )
-
-    @property
-    def minibatch(self) -> int:
-        """Transitions of one gradient step."""
-        return self.collected // self.minibatches
-
-    @property
-    def shareable(self) -> int:
-        return math.gcd(self.num_envs, self.minibatch // self.accumulate)
 
     @property
     def learning_rate_schedule(self) -> optax.Schedule:
@@ -111,14 +102,27 @@ class TrainState:
 
 
 @struct.dataclass
-class Transitions:
+class Draws:
+    """All that is random in an iteration, drawn for all N environments on any number of devices.
+
+    noise: `[T, N, A]` of actions; keys: `[T, N]` of environments; order: `[E, N, T]` in which steps
+        of each environment are learned from, in each epoch.
+    """
+
+    noise: jax.Array
+    keys: jax.Array
+    order: jax.Array
+
+
+@struct.dataclass
+class Rollout:
     """Steps as collected, `[T, N]`, and what the networks of that time made of them.
 
     log_prob: of the actions, which are not clipped; value, next_value: of what was seen before and
         after the step, unless an episode has terminated.
     """
 
-    experience: Experience
+    steps: Steps
     log_prob: jax.Array
     value: jax.Array
     next_value: jax.Array
@@ -139,8 +143,11 @@ class Batch:
     target: jax.Array
 
 
+_STATE: Any = TrainState(WHOLE, WHOLE, WHOLE, WHOLE, WHOLE, WHOLE, ROWS)  # pyright: ignore
+
+
 @dataclass(frozen=True)
-class PPO:
+class PPO(PolicyAlgorithm[TrainState]):
     """PPO on a gymnax environment with a flat observation and a bounded Box of actions.
 
     env: static; its parameters are an argument of every function.
@@ -148,18 +155,20 @@ class PPO:
     senses: how the networks read observations.
     """
 
+    specs: ClassVar[Any] = _STATE
+
     env: Environment
     config: PPOConfig
     outcomes: Outcomes = lambda info: {}
     senses: Senses = Senses()
 
-    def init(self, env_params: Params, key: jax.Array) -> TrainState:
+    def init(self, data: Params, key: jax.Array) -> TrainState:
         """The state before the first iteration."""
         key, reset_key, actor_key, critic_key = jax.random.split(key, 4)
-        running = environments.start(self.env, env_params, self.config.num_envs, reset_key)
+        running = collect.start(self.env, data, self.config.num_envs, reset_key)
         observation = running.observation
         params = {
-            "actor": self._actor(env_params).init(actor_key, observation[0]),
+            "actor": self._actor(data).init(actor_key, observation[0]),
             "critic": self._critic.init(critic_key, observation[0]),
         }
         return TrainState(
@@ -172,57 +181,32 @@ class PPO:
             environments=running,
         )
 
-    def iterate(self, env_params: Params, state: TrainState) -> tuple[TrainState, Metrics]:
-        """Collects transitions and learns from them; jit it with `state` donated.
+    def iterate(self, data: Params, state: TrainState) -> tuple[TrainState, Metrics]:
+        """Collects `[T, N]` steps and learns from them; jit it with `state` donated.
 
         The metrics are scalars. Those of episodes are means over the episodes that ended in
         this iteration, NaN if there were none; `finite` says whether all weights still are.
         """
         key, collect_key, update_key = jax.random.split(state.key, 3)
-        with jax.named_scope("collect"):
-            running, transitions = self._collect(env_params, state, collect_key)
-        with jax.named_scope("advantages"):
-            experience = transitions.experience
-            returns, observations = state.returns, state.observations
-            if self.config.normalise_rewards:
-                returns = returns.update(experience.discounted_return)
-            if self.config.normalise_observations:
-                # From the next iteration on: within one, all are normalised alike.
-                observations = observations.update(experience.observation)
-            batch = self._batch(state, returns, transitions)
-        with jax.named_scope("update"):
-            params, optimiser, losses = self._update(env_params, state, batch, update_key)
-        metrics = {
-            **losses,
-            **environments.episodes(experience),
-            "reward": jnp.mean(experience.reward),
-            "explained_variance": 1 - jnp.var(batch.target - batch.value) / jnp.var(batch.target),
-            "finite": all_finite((params, losses)),
-        }
-        state = TrainState(
-            iteration=state.iteration + 1,
-            key=key,
-            params=params,
-            optimiser=optimiser,
-            observations=observations,
-            returns=returns,
-            environments=running,
+        draws = self._draws(data, collect_key, update_key)
+        on_device = parallel.shard(
+            self._iterate, (WHOLE, self.specs, _BY_ENVIRONMENT), (self.specs, WHOLE)
         )
-        return state, metrics
+        return on_device(data, replace(state, key=key), draws)
 
-    def policy(self, env_params: Params, state: TrainState) -> MeanAction:
+    def policy(self, data: Params, state: TrainState) -> MeanAction:
         """What `state` has learned."""
-        actor, params = self._actor(env_params), state.params["actor"]
+        actor, params = self._actor(data), state.params["actor"]
         return MeanAction(actor, params, state.observations)
 
-    def value(self, env_params: Params, state: TrainState) -> Value:
+    def value(self, data: Params, state: TrainState) -> Value:
         """What `state` expects of its policy."""
-        del env_params  # which other algorithms need
+        del data  # which other algorithms need
         params, scale = state.params["critic"], state.returns.std
         return Value(self._critic, params, state.observations, scale)
 
-    def _actor(self, env_params: Params) -> Actor:
-        actions = math.prod(self.env.action_space(env_params).shape)
+    def _actor(self, data: Params) -> Actor:
+        actions = math.prod(self.env.action_space(data).shape)
         config = self.config
         return Actor(actions, config.hidden, config.initial_log_std, self.senses)
 
@@ -237,150 +221,178 @@ class PPO:
     def _value(self, params: Params, observation: jax.Array) -> jax.Array:
         return cast(jax.Array, self._critic.apply(params["critic"], observation))
 
-    def _collect(
-        self, env_params: Params, state: TrainState, key: jax.Array
-    ) -> tuple[Environments, Transitions]:
-        """T steps of N environments with the policy as it is."""
-        actor, config = self._actor(env_params), self.config
+    def _draws(self, data: Params, collect_key: jax.Array, update_key: jax.Array) -> Draws:
+        config, actions = self.config, self.env.action_space(data).shape
+        environments, epochs = config.num_envs, config.epochs
+        step_keys = jax.vmap(jax.random.split)(jax.random.split(collect_key, config.num_steps))
+        order_keys = jax.random.split(update_key, epochs * environments)
+        permutation = partial(jax.random.permutation, x=config.num_steps)
+        order = jax.vmap(permutation)(order_keys)
+        return Draws(
+            noise=jax.vmap(lambda key: jax.random.normal(key, (environments, *actions)))(
+                step_keys[:, 0]
+            ),
+            keys=jax.vmap(lambda key: jax.random.split(key, environments))(step_keys[:, 1]),
+            order=order.reshape(epochs, environments, -1),
+        )
 
-        def advance(running: Environments, key: jax.Array) -> tuple[Environments, Transitions]:
-            action_key, step_key = jax.random.split(key)
+    def _iterate(self, data: Params, state: TrainState, draws: Draws) -> tuple[TrainState, Metrics]:
+        """An iteration of one device with N environments of its own."""
+        config, observations, returns = self.config, state.observations, state.returns
+        with jax.named_scope("collect"):
+            running, rollout = self._collect(data, state, draws)
+        with jax.named_scope("advantages"):
+            steps = rollout.steps
+            if config.normalise_rewards:
+                returns = returns.update(steps.discounted_return)
+            if config.normalise_observations:
+                # From the next iteration on: within one, all are normalised alike.
+                observations = observations.update(steps.observation)
+            advantage = gae(
+                steps.reward / returns.std,
+                rollout.value,
+                rollout.next_value,
+                steps.terminated,
+                steps.truncated,
+                config.discount,
+                config.trace,
+            )
+            batch = Batch(
+                observation=steps.observation,
+                action=steps.action,
+                log_prob=rollout.log_prob,
+                value=rollout.value,
+                advantage=advantage,
+                target=advantage + rollout.value,
+            )
+        with jax.named_scope("update"):
+            params, optimiser, losses = self._update(data, state, batch, draws.order)
+        (_, unexplained), (_, variance) = map(
+            parallel.moments, (batch.target - batch.value, batch.target)
+        )
+        metrics = {
+            **losses,
+            **collect.episode_metrics(steps),
+            "reward": parallel.mean(jnp.mean(steps.reward)),
+            "explained_variance": 1 - unexplained / variance,
+            "finite": all_finite((params, losses)),
+        }
+        state = replace(
+            state,
+            iteration=state.iteration + 1,
+            params=params,
+            optimiser=optimiser,
+            observations=observations,
+            returns=returns,
+            environments=running,
+        )
+        return state, metrics
+
+    def _collect(
+        self, data: Params, state: TrainState, draws: Draws
+    ) -> tuple[Environments, Rollout]:
+        """T steps of N environments with the policy as it is."""
+        actor, discount = self._actor(data), self.config.discount
+
+        def value_of(observation: jax.Array) -> jax.Array:
+            return self._value(state.params, state.observations.normalise(observation))
+
+        def advance(
+            running: Environments, draw: tuple[jax.Array, jax.Array]
+        ) -> tuple[Environments, Rollout]:
+            noise, keys = draw
             seen = state.observations.normalise(running.observation)
             policy = cast(Gaussian, actor.apply(state.params["actor"], seen))
-            action = policy.sample(action_key)
-            running, experience, final = environments.step(
-                self.env, env_params, self.outcomes, config.discount, running, action, step_key
+            action = policy.mean + jnp.exp(policy.log_std) * noise
+            running, steps, final = collect.step(
+                self.env, data, self.outcomes, discount, running, action, keys
+            )
+            # What follows is valued one step later, unless an episode was cut off.
+            next_value = jax.lax.cond(
+                jnp.any(steps.truncated), value_of, lambda x: jnp.zeros(len(x)), final
             )
             value = self._value(state.params, seen)
-            last = value_of_last(value_of, final, experience.truncated)
-            return running, Transitions(experience, policy.log_prob(action), value, last)
+            return running, Rollout(steps, policy.log_prob(action), value, next_value)
 
-        def if_any_truncated(value: Value, final: jax.Array, truncated: jax.Array) -> jax.Array:
-            zeros = jnp.zeros(len(final))
-            return jax.lax.cond(jnp.any(truncated), lambda: value(final), lambda: zeros)
-
-        value_of = replace(self.value(env_params, state), scale=jnp.float32(1))
-        # They are few; all others are valued one step later. Devices need not wait for each other.
-        value_of_last = parallel.shard(
-            if_any_truncated, (parallel.WHOLE, parallel.ROWS, parallel.ROWS), parallel.ROWS
-        )
-        keys = jax.random.split(key, self.config.num_steps)
-        running, transitions = jax.lax.scan(advance, state.environments, keys)
-        following = value_of(running.observation)
-        following = jnp.concatenate([transitions.value[1:], following[None]])
-        done = transitions.experience.done
-        next_value = jnp.where(done, transitions.next_value, following)
-        return running, replace(transitions, next_value=next_value)
-
-    def _batch(
-        self, state: TrainState, returns: RunningStatistics, transitions: Transitions
-    ) -> Batch:
-        """Transitions to what the loss is made of, `[T, N]`."""
-        experience = transitions.experience
-        advantage = generalised_advantages(
-            experience.reward / returns.std,
-            transitions.value,
-            transitions.next_value,
-            experience.terminated,
-            experience.truncated,
-            self.config.discount,
-            self.config.trace,
-        )
-        return Batch(
-            observation=experience.observation,
-            action=experience.action,
-            log_prob=transitions.log_prob,
-            value=transitions.value,
-            advantage=advantage,
-            target=advantage + transitions.value,
-        )
+        running, rollout = jax.lax.scan(advance, state.environments, (draws.noise, draws.keys))
+        following = jnp.concatenate([rollout.value[1:], value_of(running.observation)[None]])
+        next_value = jnp.where(rollout.steps.done, rollout.next_value, following)
+        return running, replace(rollout, next_value=next_value)
 
     def _update(
-        self, env_params: Params, state: TrainState, batch: Batch, key: jax.Array
+        self, data: Params, state: TrainState, batch: Batch, order: jax.Array
     ) -> tuple[Params, optax.OptState, Metrics]:
         """`epochs` passes of `minibatches` gradient steps; the losses are means over all.
 
-        Minibatches have as many rows of each group of environments, which are `shareable`: devices
-        that share out the groups need none of each other's observations.
+        A minibatch has T / `minibatches` steps of every environment.
         """
-        config = self.config
-        groups = config.shareable
-        batch = jax.tree.map(lambda x: x.reshape(len(x), groups, -1, *x.shape[2:]), batch)
-
-        def chosen(leaf: jax.Array, rows: jax.Array, *numbers: slice) -> jax.Array:
-            """Of `[T, G, N / G, ...]` the rows `[G, R]` of each group, `[G R, ...]`."""
-
-            def of_group(x: jax.Array, row: jax.Array) -> jax.Array:
-                return x[*jnp.divmod(row, leaf.shape[2]), *numbers]
-
-            found = jax.vmap(of_group, in_axes=(1, 0))(leaf, rows)
-            return parallel.share(found.reshape(-1, *found.shape[2:]))
-
-        def seen(rows: jax.Array) -> jax.Array:
-            """Chosen observations, normalised."""
-            # Not before, and each part by itself, so that it is normalised while it is copied:
-            # copies of observations take long to write.
-            return jnp.concatenate(
-                [
-                    state.observations.of(part).normalise(chosen(batch.observation, rows, part))
-                    for part in self.senses.parts
-                ],
-                axis=-1,
-            )
-
-        actor, optimiser = self._actor(env_params), self._optimiser
-
-        def loss(params: Params, batch: Batch) -> tuple[jax.Array, Metrics]:
-            policy = cast(Gaussian, actor.apply(params["actor"], batch.observation))
-            log_ratio = policy.log_prob(batch.action) - batch.log_prob
-            ratio = jnp.exp(log_ratio)
-            clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
-            policy_loss = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
-
-            value = self._value(params, batch.observation)
-            error = (value - batch.target) ** 2
-            if config.value_clip is not None:
-                change = jnp.clip(value - batch.value, -config.value_clip, config.value_clip)
-                error = jnp.maximum(error, (batch.value + change - batch.target) ** 2)
-            value_loss = 0.5 * jnp.mean(error)
-
-            entropy = policy.entropy()
-            total = policy_loss + config.value_weight * value_loss - config.entropy_weight * entropy
-            return total, {
-                "policy_loss": policy_loss,
-                "value_loss": value_loss,
-                "entropy": entropy,
-                # The estimator k3 of Schulman (2020), "Approximating KL divergence".
-                "kl": jnp.mean(ratio - 1 - log_ratio),
-                "clip_fraction": jnp.mean(jnp.abs(ratio - 1) > config.clip),
-            }
+        config, optimiser = self.config, self._optimiser
+        epochs, environments, _ = order.shape
+        rows = order.reshape(epochs, environments, config.minibatches, config.accumulate, -1)
+        rows = jnp.moveaxis(rows, 1, 3)
+        rows = rows.reshape(-1, config.accumulate, environments, rows.shape[-1])
+        # Of all minibatches at once, lest devices wait for each other twice more in each.
+        advantage = jax.vmap(jax.vmap(partial(take, batch.advantage)))(rows)
+        mean, variance = parallel.moments(advantage, axis=(1, 2))
 
         def descend(carry: tuple[Params, optax.OptState], minibatch: tuple[jax.Array, ...]):
             (params, optimiser_state), (rows, mean, deviation) = carry, minibatch
 
             def of_part(rows: jax.Array) -> tuple[Params, Metrics]:
-                part = jax.tree.map(lambda leaf: chosen(leaf, rows), batch)
+                part = jax.tree.map(lambda leaf: take(leaf, rows), batch)
                 advantage = (part.advantage - mean) / (deviation + 1e-8)
-                part = replace(part, observation=seen(rows), advantage=advantage)
-                return jax.grad(loss, has_aux=True)(params, part)
+                part = replace(
+                    part, observation=self._seen(state, batch, rows), advantage=advantage
+                )
+                return jax.grad(self._loss, has_aux=True)(params, data, part)
 
-            gradients, losses = mean_in_turns(of_part, rows)
+            gradients, losses = parallel.mean(mean_in_turns(of_part, rows))
             updates, optimiser_state = optimiser.update(gradients, optimiser_state, params)
             return (optax.apply_updates(params, updates), optimiser_state), losses
 
-        rows = self._minibatches(key)
-        # Of all minibatches at once, lest devices wait for each other twice more in each.
-        advantage = jax.vmap(jax.vmap(partial(chosen, batch.advantage)))(rows)
-        mean, deviation = jnp.mean(advantage, axis=(1, 2)), jnp.std(advantage, axis=(1, 2))
         (params, optimiser_state), losses = jax.lax.scan(
-            descend, (state.params, state.optimiser), (rows, mean, deviation)
+            descend, (state.params, state.optimiser), (rows, mean, jnp.sqrt(variance))
         )
         return params, optimiser_state, jax.tree.map(jnp.mean, losses)
 
-    def _minibatches(self, key: jax.Array) -> jax.Array:
-        """`[epochs * minibatches, accumulate, G, R]` rows of each group, all once an epoch."""
-        config, groups = self.config, self.config.shareable
-        shuffle = jax.vmap(lambda key: jax.random.permutation(key, config.collected // groups))
-        rows = shuffle(jax.random.split(key, config.epochs * groups))
-        rows = rows.reshape(config.epochs, groups, config.minibatches, config.accumulate, -1)
-        return jnp.moveaxis(rows, 1, 3).reshape(-1, config.accumulate, groups, rows.shape[-1])
+    def _seen(self, state: TrainState, batch: Batch, rows: jax.Array) -> jax.Array:
+        """Observations of these rows, normalized."""
+        # Not before, and each part by itself, so that it is normalized while it is copied: copies
+        # of observations take long to write.
+        parts = [
+            state.observations.of(part).normalise(take(batch.observation, rows, part))
+            for part in self.senses.parts
+        ]
+        return jnp.concatenate(parts, axis=-1)
+
+    def _loss(self, params: Params, data: Params, batch: Batch) -> tuple[jax.Array, Metrics]:
+        config = self.config
+        policy = cast(Gaussian, self._actor(data).apply(params["actor"], batch.observation))
+        log_ratio = policy.log_prob(batch.action) - batch.log_prob
+        ratio = jnp.exp(log_ratio)
+        clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
+        policy_loss = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
+
+        value = self._value(params, batch.observation)
+        error = (value - batch.target) ** 2
+        if config.value_clip is not None:
+            change = jnp.clip(value - batch.value, -config.value_clip, config.value_clip)
+            error = jnp.maximum(error, (batch.value + change - batch.target) ** 2)
+        value_loss = 0.5 * jnp.mean(error)
+
+        entropy = policy.entropy()
+        total = policy_loss + config.value_weight * value_loss - config.entropy_weight * entropy
+        return total, {
+            "policy_loss": policy_loss,
+            "value_loss": value_loss,
+            "entropy": entropy,
+            # The estimator k3 of Schulman (2020), "Approximating KL divergence".
+            "kl": jnp.mean(ratio - 1 - log_ratio),
+            "clip_fraction": jnp.mean(jnp.abs(ratio - 1) > config.clip),
+        }
+
+
+def take(leaf: jax.Array, rows: jax.Array, *numbers: slice) -> jax.Array:
+    """Of `[T, N, ...]` the steps `[N, R]` of each environment, `[N R, ...]`."""
+    found = jax.vmap(lambda x, row: x[row, *numbers], in_axes=(1, 0))(leaf, rows)
+    return found.reshape(-1, *found.shape[2:])

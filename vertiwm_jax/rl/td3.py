@@ -10,7 +10,7 @@ from flax import struct
 
 from vertiwm_jax.config import Count, NotNegative, settings
 from vertiwm_jax.networks.policy import Senses, Squashed, SquashedActor
-from vertiwm_jax.rl.environments import Metrics
+from vertiwm_jax.rl.collect import Metrics
 from vertiwm_jax.rl.off_policy import Networks, OffPolicyConfig, Params, Remembered
 
 

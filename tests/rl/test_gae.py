@@ -1,7 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.rl.advantages import generalised_advantages
+from vertiwm_jax.rl.gae import gae
 
 RNG = np.random.default_rng(0)
 T, N = 12, 5
@@ -22,12 +22,12 @@ def test_advantages_equal_a_plain_loop():
                 following = 0.0
             following = expected[t, n] = error + DISCOUNT * TRACE * following
     arrays = (REWARDS, VALUES, NEXT_VALUES, TERMINATED, TRUNCATED)
-    found = generalised_advantages(*map(jnp.asarray, arrays), DISCOUNT, TRACE)
+    found = gae(*map(jnp.asarray, arrays), DISCOUNT, TRACE)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_a_value_that_is_not_a_number_after_the_end_does_no_harm():
     next_values = jnp.where(TERMINATED, jnp.nan, NEXT_VALUES)
     arrays = (REWARDS, VALUES, next_values, TERMINATED, TRUNCATED)
-    found = generalised_advantages(*map(jnp.asarray, arrays), DISCOUNT, TRACE)
+    found = gae(*map(jnp.asarray, arrays), DISCOUNT, TRACE)
     assert bool(jnp.all(jnp.isfinite(found)))

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from vertiwm_jax import parallel
+
 EPSILON = 1e-8
 CLIP = 10.0
 
@@ -30,23 +32,29 @@ class RunningStatistics:
         return cls(jnp.zeros(shape), jnp.ones(shape), jnp.zeros(()))
 
     def update(self, samples: jax.Array) -> Self:
-        """Adds `[B..., ...]` samples (any leading axes), by Chan et al. (1979), eq. 2.1."""
+        """Adds `[B..., ...]` samples (any leading axes) of all devices that share a batch.
+
+        By Chan et al. (1979), eq. 2.1.
+        """
         batch = samples.shape[: samples.ndim - self.mean.ndim]
-        added, within = math.prod(batch), jnp.float32(0)
+        added, within = math.prod(batch) * parallel.sharing(), jnp.float32(0)
         if len(batch) > 1:
             # Sample by sample along the first axis, each row of the others by itself: intermediate
             # results of all take long to write, and devices that share rows need not be waited for.
             own = RunningStatistics.create(samples.shape[1:])
-            own = jax.lax.scan(lambda known, x: (known.update(x[None]), None), own, samples)[0]
+            own = jax.lax.scan(lambda known, x: (known._with(x, 0.0, 1), None), own, samples)[0]
             batch, samples, within = batch[1:], own.mean, own.variance
 
         def average(x: jax.Array) -> jax.Array:
             # As a product, which a CPU computes several times as fast as sums over first axes.
             total = jnp.tensordot(jnp.ones(batch), x, axes=len(batch), precision="highest")
-            return total / math.prod(batch)
+            return parallel.mean(total / math.prod(batch))
 
         mean = average(samples)
-        variance = average(within + (samples - mean) ** 2)
+        return self._with(mean, average(within + (samples - mean) ** 2), added)
+
+    def _with(self, mean: jax.Array, variance: jax.Array | float, added: int) -> Self:
+        """With so many samples more, of this mean and variance."""
         count = self.count + added
         share = added / count
         delta = mean - self.mean

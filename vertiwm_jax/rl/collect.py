@@ -1,4 +1,4 @@
-"""Environments side by side, and what an algorithm experiences in them."""
+"""Steps of environments side by side, which algorithms learn from."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -34,7 +34,7 @@ class Environments:
 
 
 @struct.dataclass
-class Experience:
+class Steps:
     """Steps of environments, `[..., N]`.
 
     observation: `[..., N, O]` before the step, not normalised; action: `[..., N, A]` as chosen, 1
@@ -59,37 +59,42 @@ class Experience:
         return self.terminated | self.truncated
 
 
-def start(env: Environment, env_params: Any, number: int, key: jax.Array) -> Environments:
-    """The beginning of `number` episodes."""
+def start(env: Environment, data: Any, number: int, key: jax.Array) -> Environments:
+    """The beginning of `number` episodes; `data` are the environment's parameters."""
     keys = jax.random.split(key, number)
-    observation, state = parallel.vmap(env.reset, (0, None))(keys, env_params)
+    observation, state = jax.vmap(env.reset, (0, None))(keys, data)
     zeros = jnp.zeros(number)
     return Environments(state, observation, zeros, zeros, zeros)
 
 
 def step(
     env: Environment,
-    env_params: Any,
+    data: Any,
     outcomes: Outcomes,
     discount: float,
     environments: Environments,
     action: jax.Array,
-    key: jax.Array,
-) -> tuple[Environments, Experience, jax.Array]:
-    """A step of all; episodes that end begin anew.
+    keys: jax.Array,
+) -> tuple[Environments, Steps, jax.Array]:
+    """A step of all environments; episodes that end begin anew.
 
-    action: `[N, A]`, clipped to [-1, 1] and scaled to the environment's range. Also gives the
-    observations `[N, O]` after the step and before any new beginning.
+    Args:
+        data: the environment's parameters.
+        action: `[N, A]`, clipped to [-1, 1] and scaled to the environment's range.
+        keys: `[N]` random keys.
+
+    Returns:
+        The environments after the step, the step, and the observations `[N, O]` after it and
+        before any new beginning.
     """
-    space = env.action_space(env_params)
+    space = env.action_space(data)
     low, high = jnp.asarray(space.low), jnp.asarray(space.high)
     bounded = low + (high - low) * (jnp.clip(action, -1, 1) + 1) / 2
-    keys = jax.random.split(key, len(action))
     step_all = parallel.vmap(env.step, (0, 0, 0, None))
     observation, state, reward, terminated, truncated, info = step_all(
-        keys, environments.state, bounded, env_params
+        keys, environments.state, bounded, data
     )
-    experience = Experience(
+    steps = Steps(
         observation=environments.observation,
         action=action,
         reward=reward,
@@ -102,30 +107,30 @@ def step(
     )
 
     def running(total: jax.Array) -> jax.Array:
-        return jnp.where(experience.done, 0.0, total)
+        return jnp.where(steps.done, 0.0, total)
 
     environments = replace(
         environments,
         state=state,
         observation=observation,
-        discounted_return=running(experience.discounted_return),
-        episode_return=running(experience.episode_return),
-        episode_length=running(experience.episode_length),
+        discounted_return=running(steps.discounted_return),
+        episode_return=running(steps.episode_return),
+        episode_length=running(steps.episode_length),
     )
-    return environments, experience, info["final_observation"]
+    return environments, steps, info["final_observation"]
 
 
-def episodes(experience: Experience) -> Metrics:
-    """Means over the episodes that ended, and how many did; NaN if none."""
-    done = experience.done
-    count = jnp.sum(done)
+def episode_metrics(steps: Steps) -> Metrics:
+    """Means over the episodes that ended on all devices, and how many did; NaN if none."""
 
-    def mean(x: jax.Array) -> jax.Array:
-        return jnp.sum(jnp.where(done, x, 0.0)) / count
+    def sum_of_last(x: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.where(steps.done, x, 0.0))
 
-    return {
-        "episodes": count,
-        "episode_return": mean(experience.episode_return),
-        "episode_length": mean(experience.episode_length),
-        **jax.tree.map(mean, experience.outcomes),
+    last = {
+        "episode_return": steps.episode_return,
+        "episode_length": steps.episode_length,
+        **steps.outcomes,
     }
+    count = jnp.sum(steps.done, dtype=jnp.float32)
+    count, sums = parallel.total((count, jax.tree.map(sum_of_last, last)))
+    return {"episodes": count, **jax.tree.map(lambda x: x / count, sums)}

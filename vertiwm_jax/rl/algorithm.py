@@ -1,10 +1,16 @@
-"""Settings that all algorithms have, with the defaults of PPO."""
+"""What all algorithms that learn a policy share: settings, with the defaults of PPO, and seams."""
 
 import math
+from abc import abstractmethod
+from typing import Any, TypeVar
 
 import optax
 
 from vertiwm_jax.config import Count, Positive, Share, settings
+from vertiwm_jax.rl.learned import MeanAction, TwinValue, Value
+from vertiwm_jax.training import Algorithm
+
+State = TypeVar("State")
 
 
 @settings
@@ -36,11 +42,6 @@ class LearningConfig:
         return self.num_envs * self.num_steps
 
     @property
-    def shareable(self) -> int:
-        """What divides the sizes of all its batches: that many devices can share them evenly."""
-        return self.num_envs
-
-    @property
     def iterations(self) -> int:
         """Iterations of the whole training."""
         return math.ceil(self.transitions / self.collected)
@@ -50,3 +51,24 @@ class LearningConfig:
         clip = optax.clip_by_global_norm(self.max_gradient_norm)
         # All weights as one vector, or XLA would compile the same for each of them.
         return optax.flatten(optax.chain(clip, optax.adam(rate, eps=eps)))
+
+
+class PolicyAlgorithm(Algorithm[State]):
+    """An algorithm that learns a policy from environments; `data` are their parameters.
+
+    config: a `LearningConfig`.
+    """
+
+    config: Any
+
+    @property
+    def batch(self) -> int:
+        return self.config.num_envs
+
+    @abstractmethod
+    def policy(self, data: Any, state: State) -> MeanAction:
+        """What `state` has learned."""
+
+    @abstractmethod
+    def value(self, data: Any, state: State) -> Value | TwinValue:
+        """What `state` expects of its policy."""

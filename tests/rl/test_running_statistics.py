@@ -2,7 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vertiwm_jax.rl.normalise import CLIP, RunningStatistics
+from vertiwm_jax.rl.running_statistics import CLIP, RunningStatistics
 
 RNG = np.random.default_rng(0)
 
