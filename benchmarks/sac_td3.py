@@ -16,7 +16,7 @@ from vertiwm_jax.rl import experiment
 def of_task(name: str, model: ModelName) -> Figures:
     """An iteration of the default training by `sac` or `td3`, inside a model."""
     config = experiment.load(configuration.default_config(name))
-    soon = replace(getattr(config, name), warm_up=config.schedule.num_envs)
+    soon = replace(getattr(config, name), learning_starts=config.schedule.num_envs)
     config = replace(config, model=model, **{name: soon})
     training, _ = experiment.training_environment(config)
     return iteration(config.algorithm(training.env), training.params, config.action_repeat)

@@ -23,7 +23,6 @@ from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of, rest_o
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.models.registry import load_model
-from vertiwm_jax.rl.off_policy import OffPolicy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
 from vertiwm_jax.rl.td3 import TD3, TD3Config
@@ -32,7 +31,7 @@ from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import worlds
 
 COLLECTED = {"transitions": 64, "num_envs": 8, "num_steps": 8, "hidden": (8,)}
-REPLAYED = COLLECTED | {"updates": 1, "batch": 8, "capacity": 64, "warm_up": 64}
+REPLAYED = COLLECTED | {"updates": 1, "batch": 8, "buffer_size": 64, "learning_starts": 64}
 
 
 def drive(model: Dynamics, params: Any) -> VehicleState:
@@ -73,8 +72,8 @@ CASES = {
         1
     ],
     "ppo": lambda: learn(lambda env: PPO(env, PPOConfig(**COLLECTED, minibatches=2, epochs=1))),
-    "sac": lambda: learn(lambda env: OffPolicy(env, SAC(SACConfig(**REPLAYED)))),
-    "td3": lambda: learn(lambda env: OffPolicy(env, TD3(TD3Config(**REPLAYED)))),
+    "sac": lambda: learn(lambda env: SAC(env, SACConfig(**REPLAYED))),
+    "td3": lambda: learn(lambda env: TD3(env, TD3Config(**REPLAYED))),
 }
 
 

@@ -36,7 +36,6 @@ from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
 from vertiwm_jax.networks.soil_predictor import BOUNDS
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.perception.perceive import perceive
-from vertiwm_jax.rl.off_policy import OffPolicy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
 from vertiwm_jax.rl.td3 import TD3, TD3Config
@@ -89,7 +88,7 @@ LEARNING = {
     "max_gradient_norm": 1.0,
     "hidden": (16,),
 }
-REPLAYING = {"updates": 2, "batch": 32, "capacity": 1024, "warm_up": 128, "target_rate": 0.05}
+REPLAYING = {"updates": 2, "batch": 32, "buffer_size": 1024, "learning_starts": 128, "tau": 0.05}
 
 
 def ground() -> TerrainMap:
@@ -277,9 +276,9 @@ def on_a_probe(name: str) -> Numbers:
         config = PPOConfig(**LEARNING, epochs=4, minibatches=2, schedule="constant")
         algorithm = PPO(env, config)
     elif name == "sac":
-        algorithm = OffPolicy(env, SAC(SACConfig(**LEARNING, **REPLAYING)))
+        algorithm = SAC(env, SACConfig(**LEARNING, **REPLAYING))
     else:
-        algorithm = OffPolicy(env, TD3(TD3Config(**LEARNING, **REPLAYING)))
+        algorithm = TD3(env, TD3Config(**LEARNING, **REPLAYING))
     state = jax.jit(algorithm.init)(params, jax.random.key(0))
     iterate = jax.jit(algorithm.iterate)
     for _ in range(3):

@@ -21,7 +21,6 @@ from vertiwm_jax.learning.objectives import RolloutLoss
 from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.rl.off_policy import OffPolicy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
 from vertiwm_jax.training import Seeds
@@ -164,12 +163,18 @@ PPO_CONFIG = PPOConfig(
     transitions=512, num_envs=16, num_steps=16, minibatches=4, epochs=2, hidden=(8,)
 )
 SAC_CONFIG = SACConfig(
-    transitions=512, num_envs=16, num_steps=16, batch=32, capacity=512, warm_up=64, hidden=(8,)
+    transitions=512,
+    num_envs=16,
+    num_steps=16,
+    batch=32,
+    buffer_size=512,
+    learning_starts=64,
+    hidden=(8,),
 )
 ALGORITHMS = {
     "ppo": PPO(Target(), PPO_CONFIG),
     "ppo, some cut off": PPO(Staggered(), PPO_CONFIG),
-    "sac": OffPolicy(Target(), SAC(SAC_CONFIG)),
+    "sac": SAC(Target(), SAC_CONFIG),
 }
 
 

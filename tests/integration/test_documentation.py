@@ -100,7 +100,8 @@ action_repeat: 2
 SHORT = {
     "ppo.yaml": TASK
     + "ppo: {transitions: 64, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1}",
-    "sac.yaml": TASK + "sac: {transitions: 128, num_envs: 8, num_steps: 8, warm_up: 64, batch: 8}",
+    "sac.yaml": TASK
+    + "sac: {transitions: 128, num_envs: 8, num_steps: 8, learning_starts: 64, batch: 8}",
     "table.yaml": """
 rows: [{algorithm: ppo, model: builtin}]
 suites: [easy]

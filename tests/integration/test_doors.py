@@ -126,8 +126,10 @@ def test_resuming_is_as_if_never_stopped(run, train, monkeypatch):
 
 @pytest.mark.parametrize("name", ["sac", pytest.param("td3", marks=pytest.mark.slow)])
 def test_other_algorithms_leave_the_same_and_resume(name, folder, tmp_path):
-    settings = "{transitions: 192, num_envs: 8, num_steps: 8, updates: 1, batch: 8, capacity: 64, "
-    settings += "warm_up: 64, hidden: [8]}"
+    settings = (
+        "{transitions: 192, num_envs: 8, num_steps: 8, updates: 1, batch: 8, buffer_size: 64, "
+    )
+    settings += "learning_starts: 64, hidden: [8]}"
     # Policies that also see the ground by the world model's encoders.
     tiny = TINY[: TINY.index("planning")].replace("settle_steps", "embeddings: true, settle_steps")
     tiny += f"{name}: {settings}\nloop: {{checkpoint_every: 2}}\n"
@@ -169,7 +171,7 @@ def test_what_is_set_beside_resume_is_kept(run, train, tmp_path):
         ("ppo: {epochs: many}", "ppo.epochs: expected int, found 'many' (str)"),
         (
             "ppo: {minibatches: 7}",
-            "ppo: minibatches: expected minibatches * accumulate, 7, to",
+            "ppo: minibatches: expected minibatches * grad_accumulation, 7, to",
         ),
         ("loop: {seeds: 0}", "loop: seeds: expected at least 1, found 0"),
     ],

@@ -49,7 +49,8 @@ navigation: {settle_steps: 1}
 action_repeat: 3
 loop: {seeds: 2}
 sac:
-  {transitions: 64, num_envs: 8, num_steps: 8, batch: 8, capacity: 64, warm_up: 64, hidden: [8]}
+  {transitions: 64, num_envs: 8, num_steps: 8, batch: 8, buffer_size: 64, learning_starts: 64,
+  hidden: [8]}
 """
 
 

@@ -115,7 +115,7 @@ def test_a_fit_that_was_stopped_ends_with_the_same_bits(new_run, monkeypatch):
 
 @pytest.mark.parametrize("batches", [1, 3])
 def test_updates_are_those_of_adamw_by_hand(batches):
-    fit = Fit(Line(), replace(CONFIG, accumulate=batches))
+    fit = Fit(Line(), replace(CONFIG, grad_accumulation=batches))
     inputs, key = FitInputs(params(), data()), jax.random.key(0)
     state, _ = jax.jit(fit.iterate)(inputs, fit.init(inputs, key))
     rate = optax.warmup_cosine_decay_schedule(0.0, 0.1, 5, 60, 0.001)
@@ -200,7 +200,7 @@ def test_entries_that_do_not_exist_cannot_be_trained(new_run):
     [
         ({"updates": -10}, "updates: expected at least 0, found -10"),
         ({"updates": 65}, "updates: expected a multiple of updates_per_iteration, 10, found 65"),
-        ({"accumulate": 0}, "accumulate: expected at least 1, found 0"),
+        ({"grad_accumulation": 0}, "grad_accumulation: expected at least 1, found 0"),
         ({"warm_up": 60}, "warm_up: expected 0 to 59 updates, found 60"),
         ({"learning_rate": 0.0}, "learning_rate: expected more than 0"),
         ({"max_gradient_norm": 0.0}, "max_gradient_norm: expected more than 0"),

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from rl.probes import Broken, Delayed, Endless, ProbeParams, Sign, Target
 
-from vertiwm_jax.rl.off_policy import OffPolicy
 from vertiwm_jax.rl.sac import SAC, SACConfig
 from vertiwm_jax.rl.td3 import TD3, TD3Config
 
@@ -20,16 +19,16 @@ SETTINGS = {
     "num_steps": 16,
     "updates": 8,
     "batch": 64,
-    "capacity": 4096,
-    "warm_up": 512,
+    "buffer_size": 4096,
+    "learning_starts": 512,
     "discount": 0.9,
-    "target_rate": 0.05,
+    "tau": 0.05,
     "learning_rate": 2e-3,
     "max_gradient_norm": 10.0,
     "hidden": (64, 64),
-    "normalise_observations": False,
-    "normalise_rewards": False,
-    "restraint": 0.0,
+    "normalize_observations": False,
+    "normalize_rewards": False,
+    "action_penalty": 0.0,
 }
 CONFIGS = {
     "sac": SACConfig(
@@ -37,14 +36,14 @@ CONFIGS = {
     ),
     "td3": TD3Config(**SETTINGS),
 }
-TARGET = {"env": Target(), "normalise_rewards": True}
+TARGET = {"env": Target(), "normalize_rewards": True}
 each = pytest.mark.parametrize("name", CONFIGS)
 
 
 def algorithm(name, env, **settings):
     config = replace(CONFIGS[name], **settings)
-    rule = SAC(config) if isinstance(config, SACConfig) else TD3(config)
-    return OffPolicy(env, rule, outcomes=lambda info: {"last": info["time"]})
+    kind = SAC if isinstance(config, SACConfig) else TD3
+    return kind(env, config, outcomes=lambda info: {"last": info["time"]})
 
 
 @functools.cache
@@ -70,7 +69,7 @@ def values(algorithm, state, *observations):
 
 @each
 def test_value_depends_on_the_observation(name):
-    sign = algorithm(name, Sign(), normalise_observations=True, normalise_rewards=True)
+    sign = algorithm(name, Sign(), normalize_observations=True, normalize_rewards=True)
     np.testing.assert_allclose(values(sign, train(sign)[0], -1.0, 1.0), [-1, 1], atol=0.1)
 
 
@@ -88,7 +87,7 @@ def test_delayed_reward_is_discounted(name):
 @each
 def test_truncation_is_bootstrapped(name):
     quiet = {"initial_temperature": 1e-9, "target_entropy": -20.0} if name == "sac" else {}
-    endless = algorithm(name, Endless(), target_rate=0.2, transitions=8192, **quiet)
+    endless = algorithm(name, Endless(), tau=0.2, transitions=8192, **quiet)
     state, metrics = train(endless, ProbeParams(max_steps_in_episode=5))
     assert float(metrics["episode_length"]) == 5
     np.testing.assert_allclose(values(endless, state, 0.0), 1 / (1 - 0.9), rtol=0.08)
@@ -107,8 +106,11 @@ def test_policy_finds_the_action_that_depends_on_the_observation(name):
 
 
 @each
-def test_restraint_keeps_actions_small_unless_more_are_worth_it(name):
-    target, observations = algorithm(name, **TARGET, restraint=100.0), jnp.array([[-1.0], [1.0]])
+def test_a_penalty_keeps_actions_small_unless_more_are_worth_it(name):
+    target, observations = (
+        algorithm(name, **TARGET, action_penalty=100.0),
+        jnp.array([[-1.0], [1.0]]),
+    )
     state, _ = train(target)
     np.testing.assert_allclose(target.policy(ProbeParams(), state)(observations), 0.0, atol=0.05)
 
@@ -132,7 +134,7 @@ def test_nothing_is_learned_while_warming_up(name):
 @each
 def test_an_average_of_the_actor_drives(name):
     single = {"policy_delay": 1} if name == "td3" else {}
-    target = algorithm(name, **TARGET, updates=1, target_rate=0.25, **single)
+    target = algorithm(name, **TARGET, updates=1, tau=0.25, **single)
     first = compiled(target)[0](ProbeParams(), jax.random.key(0)).learner.actor
     state, _ = train(target, iterations=2)  # one gradient step: see above
     average = jax.tree.map(lambda x, y: 0.75 * x + 0.25 * y, first, state.learner.actor)
@@ -142,7 +144,7 @@ def test_an_average_of_the_actor_drives(name):
 
 
 def test_a_reward_that_is_no_number_is_noticed():
-    broken = algorithm("td3", Broken(), normalise_rewards=True)
+    broken = algorithm("td3", Broken(), normalize_rewards=True)
     _, metrics = train(broken, iterations=4)
     assert not bool(metrics["finite"])
 
@@ -150,10 +152,13 @@ def test_a_reward_that_is_no_number_is_noticed():
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"capacity": 100}, "capacity: expected a multiple of num_envs, 16, found 100"),
-        ({"warm_up": 8}, "warm_up: expected num_envs, 16, to capacity, 4096, found 8"),
+        ({"buffer_size": 100}, "buffer_size: expected a multiple of num_envs, 16, found 100"),
+        (
+            {"learning_starts": 8},
+            "learning_starts: expected num_envs, 16, to buffer_size, 4096, found 8",
+        ),
         ({"updates": 0}, "updates: expected at least 1, found 0"),
-        ({"restraint": -1.0}, "restraint: expected at least 0, found -1"),
+        ({"action_penalty": -1.0}, "action_penalty: expected at least 0, found -1"),
     ],
 )
 def test_settings_that_cannot_be_are_named(settings, words):

@@ -29,8 +29,8 @@ CONFIG = PPOConfig(
     discount=0.9,
     hidden=(32,),
     learning_rate=1e-2,
-    normalise_observations=False,
-    normalise_rewards=False,
+    normalize_observations=False,
+    normalize_rewards=False,
 )
 
 
@@ -60,7 +60,7 @@ def values(ppo, state, *observations):
 
 @pytest.mark.parametrize("normalise", [False, True])
 def test_constant_reward_is_its_value(normalise):
-    config = {"normalise_observations": normalise, "normalise_rewards": False}
+    config = {"normalize_observations": normalise, "normalize_rewards": False}
     ppo = PPO(Constant(), PPOConfig(**{**vars(CONFIG), **config}))
     state, metrics = train(ppo)
     np.testing.assert_allclose(values(ppo, state, 0.0), 1.0, atol=0.02)
@@ -71,7 +71,7 @@ def test_constant_reward_is_its_value(normalise):
 
 @pytest.mark.parametrize("normalise", [False, True])
 def test_value_depends_on_the_observation(normalise):
-    config = {"normalise_observations": normalise, "normalise_rewards": normalise}
+    config = {"normalize_observations": normalise, "normalize_rewards": normalise}
     ppo = PPO(Sign(), PPOConfig(**{**vars(CONFIG), **config}))
     np.testing.assert_allclose(values(ppo, train(ppo)[0], -1.0, 1.0), [-1.0, 1.0], atol=0.05)
 
@@ -87,7 +87,7 @@ def test_delayed_reward_is_discounted():
 
 @pytest.mark.parametrize("normalise", [False, True])
 def test_policy_finds_the_action_that_depends_on_the_observation(normalise):
-    config = {"normalise_observations": normalise, "normalise_rewards": normalise}
+    config = {"normalize_observations": normalise, "normalize_rewards": normalise}
     ppo = PPO(Target(), PPOConfig(**{**vars(TARGET.config), **config}))
     state, _ = train(ppo)
     # Actions 0 and 2 of [-2, 4] are -1/3 and 1/3 of [-1, 1].
@@ -149,9 +149,9 @@ def test_learning_rate_halfway(schedule, share):
 @pytest.mark.parametrize(("minibatches", "parts"), [(7, 1), (2, 3), (16, 2)])
 def test_minibatches_and_their_parts_must_divide_the_steps(minibatches, parts):
     with pytest.raises(
-        ValueError, match=f"accumulate, {minibatches * parts}, to divide num_steps, 16"
+        ValueError, match=f"grad_accumulation, {minibatches * parts}, to divide num_steps, 16"
     ):
-        PPOConfig(num_envs=4, num_steps=16, minibatches=minibatches, accumulate=parts)
+        PPOConfig(num_envs=4, num_steps=16, minibatches=minibatches, grad_accumulation=parts)
 
 
 def test_an_epoch_learns_from_every_transition_once():
@@ -165,7 +165,7 @@ def test_an_epoch_learns_from_every_transition_once():
 
 def test_a_minibatch_in_parts_gives_the_gradient_of_the_whole():
     def learned(parts):
-        config = PPOConfig(**{**vars(CONFIG), "accumulate": parts, "value_clip": 0.1})
+        config = PPOConfig(**{**vars(CONFIG), "grad_accumulation": parts, "value_clip": 0.1})
         state, metrics = train(PPO(Target(), config), iterations=2)
         return state.params, metrics
 
@@ -173,7 +173,7 @@ def test_a_minibatch_in_parts_gives_the_gradient_of_the_whole():
 
 
 def test_what_is_learned_from_is_what_was_seen():
-    changes = {"epochs": 1, "minibatches": 1, "normalise_observations": True}
+    changes = {"epochs": 1, "minibatches": 1, "normalize_observations": True}
     config = PPOConfig(**{**vars(CONFIG), **changes})
     ppo = PPO(Pictured(), config, senses=Senses(image=(4, 4, 1)))
     state, metrics = train(ppo, iterations=20)
@@ -183,8 +183,8 @@ def test_what_is_learned_from_is_what_was_seen():
     assert np.ptp(actions) > 0.1
 
 
-def test_entropy_weight_widens_the_policy():
-    ppo = PPO(Constant(), PPOConfig(**{**vars(CONFIG), "entropy_weight": 0.1}))
+def test_ent_coef_widens_the_policy():
+    ppo = PPO(Constant(), PPOConfig(**{**vars(CONFIG), "ent_coef": 0.1}))
     first, last = (train(ppo, iterations=n)[1]["entropy"] for n in (1, 10))
     assert float(last) > float(first) + 0.1
 

@@ -6,7 +6,7 @@ What is fitted, and to what, is a `Problem`; this file knows batches only by the
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -50,11 +50,13 @@ class Problem(Protocol):
 class FitConfig:
     """How parameters are fitted."""
 
+    GONE: ClassVar = {"accumulate": "is now grad_accumulation"}
+
     updates: CountOrZero = 10_000
     """Optimiser steps (AdamW), each on a batch, or batches, of its own; 0 leaves the stage out."""
     updates_per_iteration: Count = 100
     """Updates between two validations, in one compiled call."""
-    accumulate: Count = 1
+    grad_accumulation: Count = 1
     """Batches whose gradients make one update: a larger batch in the memory of one."""
     learning_rate: Positive = 1e-3
     """The highest; it rises linearly to it and falls as a cosine."""
@@ -158,7 +160,7 @@ class Fit(Algorithm[FitState]):
             key = jax.random.fold_in(state.key, batch)
             return self.problem.loss(merge(inputs.params, trained), inputs.data, key)
 
-        several = self.config.accumulate
+        several = self.config.grad_accumulation
         value, gradient = training.mean_in_turns(
             partial(jax.value_and_grad(loss), state.trained),
             state.update * several + jnp.arange(several),

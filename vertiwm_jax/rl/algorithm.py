@@ -2,7 +2,7 @@
 
 import math
 from abc import abstractmethod
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import optax
 
@@ -16,6 +16,11 @@ State = TypeVar("State")
 @settings
 class LearningConfig:
     """How much is experienced, and what networks learn from it."""
+
+    GONE: ClassVar = {
+        "normalise_observations": "is now normalize_observations",
+        "normalise_rewards": "is now normalize_rewards",
+    }
 
     transitions: Count = 1_500_000
     """Environment steps of the whole training, rounded up to whole iterations."""
@@ -31,9 +36,9 @@ class LearningConfig:
     """Gradients are clipped to this global norm."""
     hidden: tuple[int, ...] = (128, 128)
     """Widths of the layers of the actor and of each critic."""
-    normalise_observations: bool = True
+    normalize_observations: bool = True
     """Whether observations are brought to zero mean and unit variance."""
-    normalise_rewards: bool = True
+    normalize_rewards: bool = True
     """Whether rewards are divided by the running deviation of the discounted return."""
 
     @property

@@ -28,7 +28,6 @@ from vertiwm_jax.models.registry import Imagined, ModelName, load_encoders, load
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.rl import policy
 from vertiwm_jax.rl.algorithm import LearningConfig, PolicyAlgorithm
-from vertiwm_jax.rl.off_policy import OffPolicy
 from vertiwm_jax.rl.planning import Planner, PlanningConfig
 from vertiwm_jax.rl.policy import Base, PolicyConfig, load_policy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
@@ -177,8 +176,8 @@ class SACTraining(TrainConfig):
     sac: SACConfig = SACConfig()
     """The algorithm."""
 
-    def algorithm(self, env: NavigationEnv) -> OffPolicy:
-        return OffPolicy(self.repeated(env), SAC(self.sac), outcomes, env.senses)
+    def algorithm(self, env: NavigationEnv) -> SAC:
+        return SAC(self.repeated(env), self.sac, outcomes, env.senses)
 
 
 @configuration.settings
@@ -189,8 +188,8 @@ class TD3Training(TrainConfig):
     td3: TD3Config = TD3Config()
     """The algorithm."""
 
-    def algorithm(self, env: NavigationEnv) -> OffPolicy:
-        return OffPolicy(self.repeated(env), TD3(self.td3), outcomes, env.senses)
+    def algorithm(self, env: NavigationEnv) -> TD3:
+        return TD3(self.repeated(env), self.td3, outcomes, env.senses)
 
 
 TRAININGS: dict[str, type[TrainConfig]] = {

@@ -24,7 +24,7 @@ class MeanAction:
     """The learned policy as it is used: always the mean of what it would draw.
 
     actor: the network, static; params: its weights.
-    observations: statistics that its observations are normalised by.
+    observations: statistics that its observations are normalized by.
     """
 
     actor: Actor | SquashedActor = struct.field(pytree_node=False)
@@ -33,7 +33,7 @@ class MeanAction:
 
     def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """`[..., O]` observations to `[..., A]` actions in [-1, 1]; the key is not used."""
-        seen = self.observations.normalise(observation)
+        seen = self.observations.normalize(observation)
         policy = cast(Gaussian | Squashed, self.actor.apply(self.params, seen))
         return jnp.clip(policy.mean, -1.0, 1.0)
 
@@ -43,7 +43,7 @@ class Value:
     """The return that the learned policy can expect, as far as it was learned.
 
     critic: the network, static; params: its weights.
-    observations: statistics that its observations are normalised by; scale: `[]` of its output.
+    observations: statistics that its observations are normalized by; scale: `[]` of its output.
     """
 
     critic: Critic = struct.field(pytree_node=False)
@@ -53,7 +53,7 @@ class Value:
 
     def __call__(self, observation: jax.Array) -> jax.Array:
         """`[..., O]` observations to `[...]` values, in units of reward."""
-        seen = self.observations.normalise(observation)
+        seen = self.observations.normalize(observation)
         return self.scale * cast(jax.Array, self.critic.apply(self.params, seen))
 
 
@@ -72,7 +72,7 @@ class TwinValue:
 
     def __call__(self, observation: jax.Array) -> jax.Array:
         """`[..., O]` observations to `[...]` values, in units of reward."""
-        seen = self.policy.observations.normalise(observation)
+        seen = self.policy.observations.normalize(observation)
         values = twin_values(self.critic, self.params, seen, self.policy(observation))
         return self.scale * jnp.min(values, axis=0)
 

@@ -1,12 +1,13 @@
 """Learning from what earlier policies did: what SAC and TD3 share, in one compiled program.
 
 Environments are stepped, every step goes into a replay buffer, and gradient steps are made on
-batches from it. What a gradient step is, is a `Rule`.
+batches from it.
 """
 
 import math
+from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from flax import struct
 from gymnax.environments.environment import Environment
 
 from vertiwm_jax import parallel
-from vertiwm_jax.config import Count, NotNegative, Share, settings
+from vertiwm_jax.config import ConfigError, Count, NotNegative, Share, settings
 from vertiwm_jax.networks.policy import ActionCritic, Senses, SquashedActor, twin_values
 from vertiwm_jax.rl import collect
 from vertiwm_jax.rl.algorithm import LearningConfig, PolicyAlgorithm
@@ -28,65 +29,50 @@ from vertiwm_jax.training import all_finite
 Params = Any
 
 
-class Twins(Protocol):
-    """What a rule has learned: the weights of two critics and of an actor, and these averaged.
-
-    The average drives in the end: single gradient steps throw the actor about.
-    """
-
-    @property
-    def actor(self) -> Params: ...
-
-    @property
-    def averaged(self) -> Params: ...
-
-    @property
-    def critics(self) -> Params: ...
-
-
-Learner = TypeVar("Learner", bound=Twins)
-
-
 @settings
 class OffPolicyConfig(LearningConfig):
     """Settings of an algorithm with a replay buffer; its learning rate is constant."""
+
+    GONE: ClassVar = LearningConfig.GONE | {
+        "capacity": "is now buffer_size",
+        "warm_up": "is now learning_starts",
+        "target_rate": "is now tau",
+        "restraint": "is now action_penalty",
+    }
 
     updates: Count = 8
     """Gradient steps after every step of all environments."""
     batch: Count = 512
     """Transitions in a gradient step."""
-    capacity: Count = 131_072
+    buffer_size: Count = 131_072
     """Transitions that the replay buffer holds; a multiple of num_envs."""
-    warm_up: int = 8_192
+    learning_starts: int = 8_192
     """Transitions by random actions before anything is learned."""
-    target_rate: Share = 0.005
-    """Share of the critics that the target critics take over in a gradient step (tau), and of the
-    actor that its average does."""
-    restraint: NotNegative = 0.1
+    tau: Share = 0.005
+    """Share of the critics that the target critics take over in a gradient step, and of the actor
+    that its average does."""
+    action_penalty: NotNegative = 0.1
     """What the square of actions costs the actor, in units of the mean size of values. Without it
     actors run to the limits of their actions before critics know what those are worth."""
 
     def check(self):
-        if self.capacity % self.num_envs:
-            raise ValueError(
-                f"capacity: expected a multiple of num_envs, {self.num_envs}, found {self.capacity}"
+        if self.buffer_size % self.num_envs:
+            raise ConfigError(
+                f"buffer_size: expected a multiple of num_envs, {self.num_envs}, "
+                f"found {self.buffer_size}"
             )
-        if not self.num_envs <= self.warm_up <= self.capacity:
-            raise ValueError(
-                f"warm_up: expected num_envs, {self.num_envs}, to capacity, {self.capacity}, "
-                f"found {self.warm_up}"
+        if not self.num_envs <= self.learning_starts <= self.buffer_size:
+            raise ConfigError(
+                f"learning_starts: expected num_envs, {self.num_envs}, to buffer_size, "
+                f"{self.buffer_size}, found {self.learning_starts}"
             )
-
-    @property
-    def shareable(self) -> int:
-        return math.gcd(self.num_envs, self.batch)
 
 
 @struct.dataclass
 class Remembered:
     """Transitions as replayed, `[..., B]`.
 
-    observation, following: `[..., B, O]` before and after the step, normalised once they are
+    observation, following: `[..., B, O]` before and after the step, normalized once they are
     learned from; action: `[..., B, A]` in [-1, 1]; reward, terminated: `[..., B]`.
     """
 
@@ -97,93 +83,38 @@ class Remembered:
     terminated: jax.Array
 
 
-@dataclass(frozen=True)
-class Networks:
-    """Actor, critic and optimiser as a configuration and a task have them."""
+@struct.dataclass
+class Learner:
+    """What both have learned: weights, and the states of Adam.
 
-    actor: SquashedActor
-    critic: ActionCritic
-    optimiser: optax.GradientTransformation
-    restraint: float
+    averaged: the actor over its updates, which drives in the end, for single gradient steps throw
+        the actor about; critics: two, with an axis for them; target: of the critics, behind them.
+    """
 
-    def twins(self, params: Params, observation: jax.Array, action: jax.Array) -> jax.Array:
-        """`[2, ...]` values of actions, as both critics have them."""
-        return twin_values(self.critic, params, observation, action)
-
-    def cost(self, action: jax.Array, value: jax.Array) -> jax.Array:
-        """What `[B, A]` actions cost an actor beside their values `[B]`: see `restraint`."""
-        size = jax.lax.stop_gradient(jnp.mean(jnp.abs(value)))
-        return self.restraint * size * jnp.mean(jnp.sum(action**2, axis=-1))
-
-    def init(self, key: jax.Array, observation: jax.Array) -> tuple[Params, Params]:
-        """Weights of the actor and of two critics; `observation` `[O]`."""
-        actor_key, critic_key = jax.random.split(key)
-        action = jnp.zeros(self.actor.actions)
-        keys = jax.random.split(critic_key)
-        # One after the other, as `loop.train` does with seeds.
-        critics = jax.lax.map(lambda key: self.critic.init(key, observation, action), keys)
-        return self.actor.init(actor_key, observation), critics
-
-    def fit_critics(
-        self, critics: Params, optimiser: Any, batch: Remembered, target: jax.Array
-    ) -> tuple[Params, Any, jax.Array]:
-        """A gradient step of both towards the values `[B]` that they should have; also the loss."""
-
-        def loss(critics: Params) -> jax.Array:
-            values = self.twins(critics, batch.observation, batch.action)
-            return 0.5 * jnp.sum(jnp.mean((values - target) ** 2, axis=-1))
-
-        value, gradient = jax.value_and_grad(loss)(critics)
-        return *self.descend(gradient, optimiser, critics), value
-
-    def descend(self, gradient: Params, optimiser: Any, params: Params) -> tuple[Params, Any]:
-        """A gradient step: the new parameters and the optimiser's new state."""
-        updates, optimiser = self.optimiser.update(gradient, optimiser, params)
-        return optax.apply_updates(params, updates), optimiser
+    actor: Params
+    averaged: Params
+    critics: Params
+    target: Params
+    actor_optimizer: Any
+    critic_optimizer: Any
 
 
-class Rule(Protocol[Learner]):
-    """How an algorithm explores and what it learns from a batch."""
-
-    @property
-    def config(self) -> OffPolicyConfig:
-        """The algorithm's settings."""
-        ...
-
-    def actor(self, actions: int, senses: Senses) -> SquashedActor:
-        """The network of the policy."""
-        ...
-
-    def init(self, networks: Networks, observation: jax.Array, key: jax.Array) -> Learner:
-        """The learner before the first batch; `observation` `[O]`."""
-        ...
-
-    def explore(
-        self, networks: Networks, learner: Learner, observation: jax.Array, key: jax.Array
-    ) -> jax.Array:
-        """`[N, O]` normalised observations to `[N, A]` actions in [-1, 1]."""
-        ...
-
-    def learn(
-        self, networks: Networks, learner: Learner, batch: Remembered, key: jax.Array
-    ) -> tuple[Learner, Metrics]:
-        """A gradient step on a normalised batch; the metrics are scalars, NaN for none."""
-        ...
+L = TypeVar("L", bound=Learner)
 
 
 @struct.dataclass
-class OffPolicyState(Generic[Learner]):
+class OffPolicyState(Generic[L]):
     """All that training carries from one iteration to the next.
 
     iteration: `[]` int32, iterations done. key: `[]` random key.
-    learner: of the rule. replay: of `Remembered`.
+    learner: what was learned. replay: of `Remembered`.
     observations, returns: statistics, as `ppo.TrainState` has them.
     environments: where the environments stand.
     """
 
     iteration: jax.Array
     key: jax.Array
-    learner: Learner
+    learner: L
     replay: Replay
     observations: RunningStatistics
     returns: RunningStatistics
@@ -191,54 +122,68 @@ class OffPolicyState(Generic[Learner]):
 
 
 @dataclass(frozen=True)
-class OffPolicy(PolicyAlgorithm[OffPolicyState[Learner]], Generic[Learner]):
-    """A rule on a gymnax environment with a flat observation and a bounded Box of actions.
+class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
+    """Learns on a gymnax environment with a flat observation and a bounded Box of actions.
 
-    env: static; its parameters are an argument of every function.
+    An algorithm says how it explores and what it learns from a batch.
+
+    env: static; its parameters, `data`, are an argument of every function.
     outcomes: what to report, averaged over the episodes that end in an iteration.
     senses: how the networks read observations.
     """
 
     env: Environment
-    rule: Rule[Learner]
+    config: OffPolicyConfig
     outcomes: Outcomes = lambda info: {}
     senses: Senses = Senses()
 
     @property
-    def config(self) -> OffPolicyConfig:
-        """The rule's settings."""
-        return self.rule.config
-
-    @property
     def batch(self) -> int:
-        return self.config.shareable
+        return math.gcd(self.config.num_envs, self.config.batch)
 
-    def init(self, data: Params, key: jax.Array) -> OffPolicyState[Learner]:
+    @abstractmethod
+    def actor(self, data: Params) -> SquashedActor:
+        """The network of the policy."""
+
+    @abstractmethod
+    def init_learner(self, data: Params, observation: jax.Array, key: jax.Array) -> L:
+        """The learner before the first batch; `observation` `[O]`."""
+
+    @abstractmethod
+    def explore(
+        self, data: Params, learner: L, observation: jax.Array, key: jax.Array
+    ) -> jax.Array:
+        """`[N, O]` normalized observations to `[N, A]` actions in [-1, 1]."""
+
+    @abstractmethod
+    def learn(
+        self, data: Params, learner: L, batch: Remembered, key: jax.Array
+    ) -> tuple[L, Metrics]:
+        """A gradient step on a normalized batch; the metrics are scalars, NaN for none."""
+
+    def init(self, data: Params, key: jax.Array) -> OffPolicyState[L]:
         """The state before the first iteration."""
         key, reset_key, learner_key = jax.random.split(key, 3)
         running = collect.start(self.env, data, self.config.num_envs, reset_key)
         observation = running.observation[0]
-        networks = self._networks(data)
         row = Remembered(
             observation=observation,
             following=observation,
-            action=jnp.zeros(networks.actor.actions),
+            action=jnp.zeros(self._actions(data)),
             reward=jnp.float32(0),
             terminated=jnp.array(False),
         )
         return OffPolicyState(
             iteration=jnp.int32(0),
             key=key,
-            learner=self.rule.init(networks, observation, learner_key),
-            replay=Replay.create(row, self.config.capacity),
+            learner=self.init_learner(data, observation, learner_key),
+            replay=Replay.create(row, self.config.buffer_size),
             observations=RunningStatistics.create(observation.shape),
             returns=RunningStatistics.create(()),
             environments=running,
         )
 
-    def iterate(
-        self, data: Params, state: OffPolicyState[Learner]
-    ) -> tuple[OffPolicyState[Learner], Metrics]:
+    def iterate(self, data: Params, state: OffPolicyState[L]) -> tuple[OffPolicyState[L], Metrics]:
         """`num_steps` steps of all environments, each with its gradient steps; jit it, donated.
 
         The metrics are scalars. Those of episodes are means over the episodes that ended in
@@ -248,109 +193,156 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[Learner]], Generic[Learner]):
         keys = jax.random.split(steps_key, self.config.num_steps)
 
         def advance(
-            state: OffPolicyState[Learner], key: jax.Array
-        ) -> tuple[OffPolicyState[Learner], tuple[Steps, Metrics]]:
+            state: OffPolicyState[L], key: jax.Array
+        ) -> tuple[OffPolicyState[L], tuple[Steps, Metrics]]:
             collect_key, learn_key = jax.random.split(key)
             with jax.named_scope("collect"):
-                state, experience = self._collect(data, state, collect_key)
+                state, steps = self._collect(data, state, collect_key)
             with jax.named_scope("update"):
                 state, losses = self._learn(data, state, learn_key)
-            return state, (experience, losses)
+            return state, (steps, losses)
 
-        state, (experience, losses) = jax.lax.scan(advance, state, keys)
+        state, (steps, losses) = jax.lax.scan(advance, state, keys)
         metrics = {
             **jax.tree.map(jnp.nanmean, losses),
-            **collect.episode_metrics(experience),
-            "reward": jnp.mean(experience.reward),
+            **collect.episode_metrics(steps),
+            "reward": jnp.mean(steps.reward),
             "finite": all_finite(state.learner),
         }
         return replace(state, iteration=state.iteration + 1, key=key), metrics
 
-    def policy(self, data: Params, state: OffPolicyState[Learner]) -> MeanAction:
+    def policy(self, data: Params, state: OffPolicyState[L]) -> MeanAction:
         """What `state` has learned."""
-        actor = self._networks(data).actor
-        return MeanAction(actor, state.learner.averaged, state.observations)
+        return MeanAction(self.actor(data), state.learner.averaged, state.observations)
 
-    def value(self, data: Params, state: OffPolicyState[Learner]) -> TwinValue:
+    def value(self, data: Params, state: OffPolicyState[L]) -> TwinValue:
         """What `state` expects of its policy."""
-        critic = self._networks(data).critic
         policy, scale = self.policy(data, state), state.returns.std
-        return TwinValue(critic, state.learner.critics, policy, scale)
+        return TwinValue(self._critic, state.learner.critics, policy, scale)
 
-    def _networks(self, data: Params) -> Networks:
-        config = self.config
-        actions = math.prod(self.env.action_space(data).shape)
-        return Networks(
-            self.rule.actor(actions, self.senses),
-            ActionCritic(config.hidden, self.senses),
-            config.adam(config.learning_rate, eps=1e-8),
-            config.restraint,
+    def init_weights(
+        self, data: Params, observation: jax.Array, key: jax.Array
+    ) -> dict[str, Params]:
+        """The fields of a `Learner`; targets are copies of their own, for states are donated."""
+        actor_key, critic_key = jax.random.split(key)
+        action = jnp.zeros(self._actions(data))
+        # One after the other, as `training.Seeds` does with seeds.
+        critics = jax.lax.map(
+            lambda key: self._critic.init(key, observation, action), jax.random.split(critic_key)
         )
+        actor = self.actor(data).init(actor_key, observation)
+        return {
+            "actor": actor,
+            "averaged": jax.tree.map(jnp.array, actor),
+            "critics": critics,
+            "target": jax.tree.map(jnp.array, critics),
+            "actor_optimizer": self.optimizer.init(actor),
+            "critic_optimizer": self.optimizer.init(critics),
+        }
 
-    def _warming_up(self, state: OffPolicyState[Learner]) -> jax.Array:
+    def twins(self, critics: Params, observation: jax.Array, action: jax.Array) -> jax.Array:
+        """`[2, ...]` values of actions, as both critics have them."""
+        return twin_values(self._critic, critics, observation, action)
+
+    def fit_critics(self, learner: L, batch: Remembered, later: jax.Array) -> tuple[L, jax.Array]:
+        """A gradient step of both critics; also the loss.
+
+        later: `[B]` values of what follows, 0 where nothing does.
+        """
+        target = batch.reward + self.config.discount * jnp.where(batch.terminated, 0.0, later)
+
+        def loss(critics: Params) -> jax.Array:
+            values = self.twins(critics, batch.observation, batch.action)
+            return 0.5 * jnp.sum(jnp.mean((values - target) ** 2, axis=-1))
+
+        value, gradient = jax.value_and_grad(loss)(learner.critics)
+        critics, optimizer = self.descend(gradient, learner.critic_optimizer, learner.critics)
+        return replace(learner, critics=critics, critic_optimizer=optimizer), value
+
+    def penalty(self, action: jax.Array, value: jax.Array) -> jax.Array:
+        """What `[B, A]` actions cost an actor beside their values `[B]`: see `action_penalty`."""
+        size = jax.lax.stop_gradient(jnp.mean(jnp.abs(value)))
+        return self.config.action_penalty * size * jnp.mean(jnp.sum(action**2, axis=-1))
+
+    def descend(self, gradient: Params, optimizer: Any, params: Params) -> tuple[Params, Any]:
+        """A gradient step: the new parameters and the optimizer's new state."""
+        updates, optimizer = self.optimizer.update(gradient, optimizer, params)
+        return optax.apply_updates(params, updates), optimizer
+
+    @property
+    def optimizer(self) -> optax.GradientTransformation:
+        """Of actor and critics."""
+        return self.config.adam(self.config.learning_rate, eps=1e-8)
+
+    @property
+    def _critic(self) -> ActionCritic:
+        return ActionCritic(self.config.hidden, self.senses)
+
+    def _actions(self, data: Params) -> int:
+        return math.prod(self.env.action_space(data).shape)
+
+    def _exploring(self, state: OffPolicyState[L]) -> jax.Array:
         """Whether actions are still random, and nothing is learned."""
-        return state.replay.filled < self.config.warm_up
+        return state.replay.filled < self.config.learning_starts
 
     def _collect(
-        self, data: Params, state: OffPolicyState[Learner], key: jax.Array
-    ) -> tuple[OffPolicyState[Learner], Steps]:
+        self, data: Params, state: OffPolicyState[L], key: jax.Array
+    ) -> tuple[OffPolicyState[L], Steps]:
         """A step of all environments, remembered."""
         explore_key, random_key, step_key = jax.random.split(key, 3)
         running, config = state.environments, self.config
-        networks = self._networks(data)
-        seen = state.observations.normalise(running.observation)
-        chosen = self.rule.explore(networks, state.learner, seen, explore_key)
+        seen = state.observations.normalize(running.observation)
+        chosen = self.explore(data, state.learner, seen, explore_key)
         anything = jax.random.uniform(random_key, chosen.shape, minval=-1.0, maxval=1.0)
-        action = jnp.where(self._warming_up(state), anything, chosen)
+        action = jnp.where(self._exploring(state), anything, chosen)
         keys = jax.random.split(step_key, config.num_envs)
-        running, experience, following = collect.step(
+        running, steps, following = collect.step(
             self.env, data, self.outcomes, config.discount, running, action, keys
         )
         rows = Remembered(
-            observation=experience.observation,
+            observation=steps.observation,
             following=following,
             action=action,
-            reward=experience.reward,
-            terminated=experience.terminated,
+            reward=steps.reward,
+            terminated=steps.terminated,
         )
         returns, observations = state.returns, state.observations
-        if config.normalise_rewards:
-            returns = returns.update(experience.discounted_return)
-        if config.normalise_observations:
-            observations = observations.update(experience.observation)
+        if config.normalize_rewards:
+            returns = returns.update(steps.discounted_return)
+        if config.normalize_observations:
+            observations = observations.update(steps.observation)
         return replace(
             state,
             replay=state.replay.add(parallel.whole(rows)),
             returns=returns,
             observations=observations,
             environments=running,
-        ), experience
+        ), steps
 
     def _learn(
-        self, data: Params, state: OffPolicyState[Learner], key: jax.Array
-    ) -> tuple[OffPolicyState[Learner], Metrics]:
-        """`updates` gradient steps, none while warming up; the metrics are means."""
-        networks = self._networks(data)
+        self, data: Params, state: OffPolicyState[L], key: jax.Array
+    ) -> tuple[OffPolicyState[L], Metrics]:
+        """`updates` gradient steps, none while exploring; the metrics are means."""
 
-        def update(learner: Learner, key: jax.Array) -> tuple[Learner, Metrics]:
+        def update(learner: L, key: jax.Array) -> tuple[L, Metrics]:
             sample_key, learn_key = jax.random.split(key)
             batch = parallel.share(state.replay.sample(sample_key, self.config.batch))
             batch = replace(
                 batch,
-                observation=state.observations.normalise(batch.observation),
-                following=state.observations.normalise(batch.following),
+                observation=state.observations.normalize(batch.observation),
+                following=state.observations.normalize(batch.following),
                 reward=batch.reward / state.returns.std,
             )
-            return self.rule.learn(networks, learner, batch, learn_key)
+            return self.learn(data, learner, batch, learn_key)
 
-        def updates(learner: Learner) -> tuple[Learner, Metrics]:
+        def updates(learner: L) -> tuple[L, Metrics]:
             keys = jax.random.split(key, self.config.updates)
             learner, losses = jax.lax.scan(update, learner, keys)
             return learner, jax.tree.map(jnp.nanmean, losses)
 
-        def none(learner: Learner) -> tuple[Learner, Metrics]:
+        def none(learner: L) -> tuple[L, Metrics]:
             nothing = jax.eval_shape(updates, learner)[1]
             return learner, jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), nothing)
 
-        learner, losses = jax.lax.cond(self._warming_up(state), none, updates, state.learner)
+        learner, losses = jax.lax.cond(self._exploring(state), none, updates, state.learner)
         return replace(state, learner=learner), losses

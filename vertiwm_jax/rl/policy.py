@@ -24,7 +24,7 @@ from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.networks.policy import ActionCritic, Actor, Critic, Senses, SquashedActor
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.rl.learned import Corrected, MeanAction, TwinValue, Value
-from vertiwm_jax.rl.normalise import RunningStatistics
+from vertiwm_jax.rl.running_statistics import RunningStatistics
 
 FOLDER = "policy"
 """Name of the folder in that of a run."""

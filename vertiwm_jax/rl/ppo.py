@@ -38,34 +38,42 @@ _BY_ENVIRONMENT = PartitionSpec(None, BATCH)
 class PPOConfig(LearningConfig):
     """Settings of PPO; the defaults suit the navigation task on the built-in simulator."""
 
+    GONE: ClassVar = LearningConfig.GONE | {
+        "accumulate": "is now grad_accumulation",
+        "trace": "is now gae_lambda",
+        "clip": "is now clip_eps",
+        "value_weight": "is now vf_coef",
+        "entropy_weight": "is now ent_coef",
+    }
+
     initial_log_std: float = -0.5
     """Log standard deviation of the first policy, in units of half the action range."""
     epochs: Count = 6
     """Passes over the data of an iteration."""
     minibatches: Count = 8
     """Gradient steps in a pass, each from as many steps of every environment; divides num_steps."""
-    accumulate: Count = 1
+    grad_accumulation: Count = 1
     """Parts of a minibatch whose gradients are computed one after the other, for less memory."""
-    trace: Share = 0.95
+    gae_lambda: Share = 0.95
     """Lambda of the generalised advantage estimator."""
-    clip: Positive = 0.2
+    clip_eps: Positive = 0.2
     """Largest change of the probability ratio that is rewarded."""
     value_clip: float | None = None
     """Largest change of a value in an iteration; none by default."""
     schedule: Literal["constant", "linear", "cosine"] = "linear"
     """How the learning rate goes, to 0 at the end unless constant."""
-    value_weight: NotNegative = 0.5
+    vf_coef: NotNegative = 0.5
     """Weight of the value loss."""
-    entropy_weight: NotNegative = 0.0
+    ent_coef: NotNegative = 0.0
     """Weight of the entropy bonus."""
 
     def check(self):
-        parts = self.minibatches * self.accumulate
+        parts = self.minibatches * self.grad_accumulation
         if self.num_steps % parts:
             divisor = math.gcd(parts, self.num_steps)
             raise ValueError(
-                f"minibatches: expected minibatches * accumulate, {parts}, to divide num_steps, "
-                f"{self.num_steps}; choose a divisor, for example {divisor}"
+                f"minibatches: expected minibatches * grad_accumulation, {parts}, to divide "
+                f"num_steps, {self.num_steps}; choose a divisor, for example {divisor}"
             )
 
     @property
@@ -86,7 +94,7 @@ class TrainState:
     iteration: `[]` int32, iterations done.
     key: `[]` random key.
     params: the networks' weights, `{"actor": ..., "critic": ...}`.
-    optimiser: the state of Adam.
+    optimizer: the state of Adam.
     observations: statistics of observations, `[O]`; those of no sample if they are used raw.
     returns: statistics of discounted returns, `[]`; likewise.
     environments: where the environments stand.
@@ -95,7 +103,7 @@ class TrainState:
     iteration: jax.Array
     key: jax.Array
     params: Params
-    optimiser: optax.OptState
+    optimizer: optax.OptState
     observations: RunningStatistics
     returns: RunningStatistics
     environments: Environments
@@ -132,7 +140,7 @@ class Rollout:
 class Batch:
     """What the loss is made of, `[T, N]` as collected, or `[B]` of them.
 
-    `target` is a lambda return; observation, advantage: in the loss, normalised.
+    `target` is a lambda return; observation, advantage: in the loss, normalized.
     """
 
     observation: jax.Array
@@ -175,7 +183,7 @@ class PPO(PolicyAlgorithm[TrainState]):
             iteration=jnp.zeros((), jnp.int32),
             key=key,
             params=params,
-            optimiser=self._optimiser.init(params),
+            optimizer=self._optimizer.init(params),
             observations=RunningStatistics.create(observation.shape[1:]),
             returns=RunningStatistics.create(()),
             environments=running,
@@ -215,7 +223,7 @@ class PPO(PolicyAlgorithm[TrainState]):
         return Critic(self.config.hidden, self.senses)
 
     @property
-    def _optimiser(self) -> optax.GradientTransformation:
+    def _optimizer(self) -> optax.GradientTransformation:
         return self.config.adam(self.config.learning_rate_schedule, eps=1e-5)
 
     def _value(self, params: Params, observation: jax.Array) -> jax.Array:
@@ -243,10 +251,10 @@ class PPO(PolicyAlgorithm[TrainState]):
             running, rollout = self._collect(data, state, draws)
         with jax.named_scope("advantages"):
             steps = rollout.steps
-            if config.normalise_rewards:
+            if config.normalize_rewards:
                 returns = returns.update(steps.discounted_return)
-            if config.normalise_observations:
-                # From the next iteration on: within one, all are normalised alike.
+            if config.normalize_observations:
+                # From the next iteration on: within one, all are normalized alike.
                 observations = observations.update(steps.observation)
             advantage = gae(
                 steps.reward / returns.std,
@@ -255,7 +263,7 @@ class PPO(PolicyAlgorithm[TrainState]):
                 steps.terminated,
                 steps.truncated,
                 config.discount,
-                config.trace,
+                config.gae_lambda,
             )
             batch = Batch(
                 observation=steps.observation,
@@ -266,7 +274,7 @@ class PPO(PolicyAlgorithm[TrainState]):
                 target=advantage + rollout.value,
             )
         with jax.named_scope("update"):
-            params, optimiser, losses = self._update(data, state, batch, draws.order)
+            params, optimizer, losses = self._update(data, state, batch, draws.order)
         (_, unexplained), (_, variance) = map(
             parallel.moments, (batch.target - batch.value, batch.target)
         )
@@ -281,7 +289,7 @@ class PPO(PolicyAlgorithm[TrainState]):
             state,
             iteration=state.iteration + 1,
             params=params,
-            optimiser=optimiser,
+            optimizer=optimizer,
             observations=observations,
             returns=returns,
             environments=running,
@@ -295,13 +303,13 @@ class PPO(PolicyAlgorithm[TrainState]):
         actor, discount = self._actor(data), self.config.discount
 
         def value_of(observation: jax.Array) -> jax.Array:
-            return self._value(state.params, state.observations.normalise(observation))
+            return self._value(state.params, state.observations.normalize(observation))
 
         def advance(
             running: Environments, draw: tuple[jax.Array, jax.Array]
         ) -> tuple[Environments, Rollout]:
             noise, keys = draw
-            seen = state.observations.normalise(running.observation)
+            seen = state.observations.normalize(running.observation)
             policy = cast(Gaussian, actor.apply(state.params["actor"], seen))
             action = policy.mean + jnp.exp(policy.log_std) * noise
             running, steps, final = collect.step(
@@ -326,17 +334,17 @@ class PPO(PolicyAlgorithm[TrainState]):
 
         A minibatch has T / `minibatches` steps of every environment.
         """
-        config, optimiser = self.config, self._optimiser
+        config, optimizer = self.config, self._optimizer
         epochs, environments, _ = order.shape
-        rows = order.reshape(epochs, environments, config.minibatches, config.accumulate, -1)
+        rows = order.reshape(epochs, environments, config.minibatches, config.grad_accumulation, -1)
         rows = jnp.moveaxis(rows, 1, 3)
-        rows = rows.reshape(-1, config.accumulate, environments, rows.shape[-1])
+        rows = rows.reshape(-1, config.grad_accumulation, environments, rows.shape[-1])
         # Of all minibatches at once, lest devices wait for each other twice more in each.
         advantage = jax.vmap(jax.vmap(partial(take, batch.advantage)))(rows)
         mean, variance = parallel.moments(advantage, axis=(1, 2))
 
         def descend(carry: tuple[Params, optax.OptState], minibatch: tuple[jax.Array, ...]):
-            (params, optimiser_state), (rows, mean, deviation) = carry, minibatch
+            (params, optimizer_state), (rows, mean, deviation) = carry, minibatch
 
             def of_part(rows: jax.Array) -> tuple[Params, Metrics]:
                 part = jax.tree.map(lambda leaf: take(leaf, rows), batch)
@@ -347,20 +355,20 @@ class PPO(PolicyAlgorithm[TrainState]):
                 return jax.grad(self._loss, has_aux=True)(params, data, part)
 
             gradients, losses = parallel.mean(mean_in_turns(of_part, rows))
-            updates, optimiser_state = optimiser.update(gradients, optimiser_state, params)
-            return (optax.apply_updates(params, updates), optimiser_state), losses
+            updates, optimizer_state = optimizer.update(gradients, optimizer_state, params)
+            return (optax.apply_updates(params, updates), optimizer_state), losses
 
-        (params, optimiser_state), losses = jax.lax.scan(
-            descend, (state.params, state.optimiser), (rows, mean, jnp.sqrt(variance))
+        (params, optimizer_state), losses = jax.lax.scan(
+            descend, (state.params, state.optimizer), (rows, mean, jnp.sqrt(variance))
         )
-        return params, optimiser_state, jax.tree.map(jnp.mean, losses)
+        return params, optimizer_state, jax.tree.map(jnp.mean, losses)
 
     def _seen(self, state: TrainState, batch: Batch, rows: jax.Array) -> jax.Array:
         """Observations of these rows, normalized."""
         # Not before, and each part by itself, so that it is normalized while it is copied: copies
         # of observations take long to write.
         parts = [
-            state.observations.of(part).normalise(take(batch.observation, rows, part))
+            state.observations.of(part).normalize(take(batch.observation, rows, part))
             for part in self.senses.parts
         ]
         return jnp.concatenate(parts, axis=-1)
@@ -370,7 +378,7 @@ class PPO(PolicyAlgorithm[TrainState]):
         policy = cast(Gaussian, self._actor(data).apply(params["actor"], batch.observation))
         log_ratio = policy.log_prob(batch.action) - batch.log_prob
         ratio = jnp.exp(log_ratio)
-        clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
+        clipped = jnp.clip(ratio, 1 - config.clip_eps, 1 + config.clip_eps)
         policy_loss = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
 
         value = self._value(params, batch.observation)
@@ -381,14 +389,14 @@ class PPO(PolicyAlgorithm[TrainState]):
         value_loss = 0.5 * jnp.mean(error)
 
         entropy = policy.entropy()
-        total = policy_loss + config.value_weight * value_loss - config.entropy_weight * entropy
+        total = policy_loss + config.vf_coef * value_loss - config.ent_coef * entropy
         return total, {
             "policy_loss": policy_loss,
             "value_loss": value_loss,
             "entropy": entropy,
             # The estimator k3 of Schulman (2020), "Approximating KL divergence".
             "kl": jnp.mean(ratio - 1 - log_ratio),
-            "clip_fraction": jnp.mean(jnp.abs(ratio - 1) > config.clip),
+            "clip_fraction": jnp.mean(jnp.abs(ratio - 1) > config.clip_eps),
         }
 
 

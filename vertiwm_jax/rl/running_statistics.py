@@ -76,6 +76,6 @@ class RunningStatistics:
         """`[...]` standard deviation, never 0."""
         return jnp.sqrt(self.variance + EPSILON)
 
-    def normalise(self, x: jax.Array) -> jax.Array:
+    def normalize(self, x: jax.Array) -> jax.Array:
         """`[..., ...]` to zero mean and unit variance, clipped to +-10."""
         return jnp.clip((x - self.mean) / self.std, -CLIP, CLIP)

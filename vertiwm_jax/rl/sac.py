@@ -13,9 +13,9 @@ import optax
 from flax import struct
 
 from vertiwm_jax.config import Positive, settings
-from vertiwm_jax.networks.policy import Senses, Squashed, SquashedActor
+from vertiwm_jax.networks.policy import Squashed, SquashedActor
 from vertiwm_jax.rl.collect import Metrics
-from vertiwm_jax.rl.off_policy import Networks, OffPolicyConfig, Params, Remembered
+from vertiwm_jax.rl.off_policy import Learner, OffPolicy, OffPolicyConfig, Params, Remembered
 
 
 @settings
@@ -25,105 +25,86 @@ class SACConfig(OffPolicyConfig):
     initial_log_std: float = -0.5
     """Log standard deviation of the first policy, in units of half the action range."""
     initial_temperature: Positive = 0.1
-    """Worth of a nat of entropy in the first policy, in units of (normalised) reward."""
+    """Worth of a nat of entropy in the first policy, in units of (normalized) reward."""
     target_entropy: float = -2.0
     """Entropy, nats, of the actions in [-1, 1] that the temperature is adjusted to keep."""
 
 
 @struct.dataclass
-class SACLearner:
-    """What SAC has learned; averaged: the actor over its updates; target: of both critics, behind
-    them; the rest are Adam's states."""
+class SACLearner(Learner):
+    """What SAC has learned, with the temperature and its state of Adam."""
 
-    actor: Params
-    averaged: Params
-    critics: Params
-    target: Params
     log_temperature: jax.Array
-    actor_optimiser: Any
-    critic_optimiser: Any
-    temperature_optimiser: Any
+    temperature_optimizer: Any
 
 
 @dataclass(frozen=True)
-class SAC:
-    """The `off_policy.Rule` of soft actor-critic."""
+class SAC(OffPolicy[SACLearner]):
+    """Soft actor-critic."""
 
     config: SACConfig
 
-    def actor(self, actions: int, senses: Senses) -> SquashedActor:
+    def actor(self, data: Params) -> SquashedActor:
         config = self.config
-        return SquashedActor(actions, config.hidden, config.initial_log_std, senses)
+        return SquashedActor(
+            self._actions(data), config.hidden, config.initial_log_std, self.senses
+        )
 
-    def init(self, networks: Networks, observation: jax.Array, key: jax.Array) -> SACLearner:
-        actor, critics = networks.init(key, observation)
+    def init_learner(self, data: Params, observation: jax.Array, key: jax.Array) -> SACLearner:
         log_temperature = jnp.log(jnp.float32(self.config.initial_temperature))
         return SACLearner(
-            actor=actor,
-            averaged=jax.tree.map(jnp.array, actor),
-            critics=critics,
-            target=jax.tree.map(jnp.array, critics),
+            **self.init_weights(data, observation, key),
             log_temperature=log_temperature,
-            actor_optimiser=networks.optimiser.init(actor),
-            critic_optimiser=networks.optimiser.init(critics),
-            temperature_optimiser=networks.optimiser.init(log_temperature),
+            temperature_optimizer=self.optimizer.init(log_temperature),
         )
 
     def explore(
-        self, networks: Networks, learner: SACLearner, observation: jax.Array, key: jax.Array
+        self, data: Params, learner: SACLearner, observation: jax.Array, key: jax.Array
     ) -> jax.Array:
-        return _policy(networks, learner.actor, observation).sample(key)[0]
+        return self._policy(data, learner.actor, observation).sample(key)[0]
 
     def learn(
-        self, networks: Networks, learner: SACLearner, batch: Remembered, key: jax.Array
+        self, data: Params, learner: SACLearner, batch: Remembered, key: jax.Array
     ) -> tuple[SACLearner, Metrics]:
         target_key, actor_key = jax.random.split(key)
         temperature = jnp.exp(learner.log_temperature)
-        action, log_prob = _policy(networks, learner.actor, batch.following).sample(target_key)
-        later = jnp.min(networks.twins(learner.target, batch.following, action), axis=0)
-        later = jnp.where(batch.terminated, 0.0, later - temperature * log_prob)
-        target = batch.reward + self.config.discount * later
-
-        critics, critic_optimiser, loss = networks.fit_critics(
-            learner.critics, learner.critic_optimiser, batch, target
-        )
+        action, log_prob = self._policy(data, learner.actor, batch.following).sample(target_key)
+        later = jnp.min(self.twins(learner.target, batch.following, action), axis=0)
+        learner, value_loss = self.fit_critics(learner, batch, later - temperature * log_prob)
 
         def actor_loss(actor: Params) -> tuple[jax.Array, jax.Array]:
-            policy = _policy(networks, actor, batch.observation)
+            policy = self._policy(data, actor, batch.observation)
             action, log_prob = policy.sample(actor_key)
-            value = jnp.minimum(*networks.twins(critics, batch.observation, action))
-            cost = networks.cost(policy.mean, value)
+            value = jnp.minimum(*self.twins(learner.critics, batch.observation, action))
+            cost = self.penalty(policy.mean, value)
             return cost + jnp.mean(temperature * log_prob - value), -jnp.mean(log_prob)
 
         (policy_loss, entropy), gradient = jax.value_and_grad(actor_loss, has_aux=True)(
             learner.actor
         )
-        actor, actor_optimiser = networks.descend(gradient, learner.actor_optimiser, learner.actor)
-        log_temperature, temperature_optimiser = networks.descend(
+        actor, actor_optimizer = self.descend(gradient, learner.actor_optimizer, learner.actor)
+        log_temperature, temperature_optimizer = self.descend(
             entropy - self.config.target_entropy,
-            learner.temperature_optimiser,
+            learner.temperature_optimizer,
             learner.log_temperature,
         )
-        rate = self.config.target_rate
+        tau = self.config.tau
         learner = replace(
             learner,
             actor=actor,
-            averaged=optax.incremental_update(actor, learner.averaged, rate),
-            critics=critics,
-            target=optax.incremental_update(critics, learner.target, rate),
+            averaged=optax.incremental_update(actor, learner.averaged, tau),
+            target=optax.incremental_update(learner.critics, learner.target, tau),
             log_temperature=log_temperature,
-            actor_optimiser=actor_optimiser,
-            critic_optimiser=critic_optimiser,
-            temperature_optimiser=temperature_optimiser,
+            actor_optimizer=actor_optimizer,
+            temperature_optimizer=temperature_optimizer,
         )
         metrics = {
-            "value_loss": loss,
+            "value_loss": value_loss,
             "policy_loss": policy_loss,
             "entropy": entropy,
             "temperature": temperature,
         }
         return learner, metrics
 
-
-def _policy(networks: Networks, actor: Params, observation: jax.Array) -> Squashed:
-    return cast(Squashed, networks.actor.apply(actor, observation))
+    def _policy(self, data: Params, actor: Params, observation: jax.Array) -> Squashed:
+        return cast(Squashed, self.actor(data).apply(actor, observation))

@@ -1,7 +1,7 @@
 """Twin delayed deep deterministic policy gradient: Fujimoto et al. (2018)."""
 
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import ClassVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -9,122 +9,96 @@ import optax
 from flax import struct
 
 from vertiwm_jax.config import Count, NotNegative, settings
-from vertiwm_jax.networks.policy import Senses, Squashed, SquashedActor
+from vertiwm_jax.networks.policy import Squashed, SquashedActor
 from vertiwm_jax.rl.collect import Metrics
-from vertiwm_jax.rl.off_policy import Networks, OffPolicyConfig, Params, Remembered
+from vertiwm_jax.rl.off_policy import Learner, OffPolicy, OffPolicyConfig, Params, Remembered
 
 
 @settings
 class TD3Config(OffPolicyConfig):
     """Settings of TD3."""
 
-    exploration: NotNegative = 0.3
+    GONE: ClassVar = OffPolicyConfig.GONE | {
+        "exploration": "is now exploration_noise",
+        "smoothing": "is now target_noise",
+        "largest_smoothing": "is now target_noise_clip",
+    }
+
+    exploration_noise: NotNegative = 0.3
     """Standard deviation of the noise on actions while learning, in units of half their range."""
-    smoothing: NotNegative = 0.2
+    target_noise: NotNegative = 0.2
     """Standard deviation of the noise on the actions that targets are made of."""
-    largest_smoothing: NotNegative = 0.5
+    target_noise_clip: NotNegative = 0.5
     """Where that noise is cut off."""
     policy_delay: Count = 2
     """Gradient steps of the critics for each of the actor and of the targets."""
 
 
 @struct.dataclass
-class TD3Learner:
-    """What TD3 has learned; targets follow behind; update: `[]` int32, gradient steps done."""
+class TD3Learner(Learner):
+    """What TD3 has learned; `averaged` is its target actor; update: `[]` int32, gradient steps."""
 
-    actor: Params
-    critics: Params
-    actor_target: Params
-    critic_target: Params
-    actor_optimiser: Any
-    critic_optimiser: Any
     update: jax.Array
-
-    @property
-    def averaged(self) -> Params:
-        """The actor over its updates, which its target is."""
-        return self.actor_target
 
 
 @dataclass(frozen=True)
-class TD3:
-    """The `off_policy.Rule` of TD3."""
+class TD3(OffPolicy[TD3Learner]):
+    """Twin delayed deep deterministic policy gradient."""
 
     config: TD3Config
 
-    def actor(self, actions: int, senses: Senses) -> SquashedActor:
-        return SquashedActor(actions, self.config.hidden, None, senses)
+    def actor(self, data: Params) -> SquashedActor:
+        return SquashedActor(self._actions(data), self.config.hidden, None, self.senses)
 
-    def init(self, networks: Networks, observation: jax.Array, key: jax.Array) -> TD3Learner:
-        actor, critics = networks.init(key, observation)
-        return TD3Learner(
-            actor=actor,
-            critics=critics,
-            actor_target=jax.tree.map(jnp.array, actor),
-            critic_target=jax.tree.map(jnp.array, critics),
-            actor_optimiser=networks.optimiser.init(actor),
-            critic_optimiser=networks.optimiser.init(critics),
-            update=jnp.int32(0),
-        )
+    def init_learner(self, data: Params, observation: jax.Array, key: jax.Array) -> TD3Learner:
+        return TD3Learner(**self.init_weights(data, observation, key), update=jnp.int32(0))
 
     def explore(
-        self, networks: Networks, learner: TD3Learner, observation: jax.Array, key: jax.Array
+        self, data: Params, learner: TD3Learner, observation: jax.Array, key: jax.Array
     ) -> jax.Array:
-        action = _action(networks, learner.actor, observation)
-        noise = self.config.exploration * jax.random.normal(key, action.shape)
+        action = self._action(data, learner.actor, observation)
+        noise = self.config.exploration_noise * jax.random.normal(key, action.shape)
         return jnp.clip(action + noise, -1.0, 1.0)
 
     def learn(
-        self, networks: Networks, learner: TD3Learner, batch: Remembered, key: jax.Array
+        self, data: Params, learner: TD3Learner, batch: Remembered, key: jax.Array
     ) -> tuple[TD3Learner, Metrics]:
         config = self.config
-        action = _action(networks, learner.actor_target, batch.following)
-        noise = config.smoothing * jax.random.normal(key, action.shape)
-        noise = jnp.clip(noise, -config.largest_smoothing, config.largest_smoothing)
+        action = self._action(data, learner.averaged, batch.following)
+        noise = config.target_noise * jax.random.normal(key, action.shape)
+        noise = jnp.clip(noise, -config.target_noise_clip, config.target_noise_clip)
         action = jnp.clip(action + noise, -1.0, 1.0)
-        later = jnp.min(networks.twins(learner.critic_target, batch.following, action), axis=0)
-        target = batch.reward + config.discount * jnp.where(batch.terminated, 0.0, later)
-
-        critics, critic_optimiser, loss = networks.fit_critics(
-            learner.critics, learner.critic_optimiser, batch, target
-        )
-        learner = replace(
-            learner,
-            critics=critics,
-            critic_optimiser=critic_optimiser,
-            update=learner.update + 1,
-        )
-        improving = learner.update % config.policy_delay == 0
+        later = jnp.min(self.twins(learner.target, batch.following, action), axis=0)
+        learner, value_loss = self.fit_critics(learner, batch, later)
+        learner = replace(learner, update=learner.update + 1)
         learner, policy_loss = jax.lax.cond(
-            improving,
-            lambda learner: self._improve(networks, learner, batch),
+            learner.update % config.policy_delay == 0,
+            lambda learner: self._improve(data, learner, batch),
             lambda learner: (learner, jnp.float32(jnp.nan)),
             learner,
         )
-        return learner, {"value_loss": loss, "policy_loss": policy_loss}
+        return learner, {"value_loss": value_loss, "policy_loss": policy_loss}
 
     def _improve(
-        self, networks: Networks, learner: TD3Learner, batch: Remembered
+        self, data: Params, learner: TD3Learner, batch: Remembered
     ) -> tuple[TD3Learner, jax.Array]:
         """A gradient step of the actor, and the targets a little nearer; also the actor's loss."""
 
         def actor_loss(actor: Params) -> jax.Array:
-            action = _action(networks, actor, batch.observation)
-            value = networks.twins(learner.critics, batch.observation, action)[0]
-            return networks.cost(action, value) - jnp.mean(value)
+            action = self._action(data, actor, batch.observation)
+            value = self.twins(learner.critics, batch.observation, action)[0]
+            return self.penalty(action, value) - jnp.mean(value)
 
         loss, gradient = jax.value_and_grad(actor_loss)(learner.actor)
-        actor, optimiser = networks.descend(gradient, learner.actor_optimiser, learner.actor)
-
-        rate = self.config.target_rate
+        actor, optimizer = self.descend(gradient, learner.actor_optimizer, learner.actor)
+        tau = self.config.tau
         return replace(
             learner,
             actor=actor,
-            actor_target=optax.incremental_update(actor, learner.actor_target, rate),
-            critic_target=optax.incremental_update(learner.critics, learner.critic_target, rate),
-            actor_optimiser=optimiser,
+            averaged=optax.incremental_update(actor, learner.averaged, tau),
+            target=optax.incremental_update(learner.critics, learner.target, tau),
+            actor_optimizer=optimizer,
         ), loss
 
-
-def _action(networks: Networks, actor: Params, observation: jax.Array) -> jax.Array:
-    return cast(Squashed, networks.actor.apply(actor, observation)).mean
+    def _action(self, data: Params, actor: Params, observation: jax.Array) -> jax.Array:
+        return cast(Squashed, self.actor(data).apply(actor, observation)).mean
