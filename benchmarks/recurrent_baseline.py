@@ -99,7 +99,9 @@ class Recurrent:
 
 def fitted(folders: list[Path], updates: int, runs: Path) -> tuple[Recurrent, RecurrentParams]:
     """From the training drives in `folders`; the run folder keeps its checkpoints."""
-    training, validation = (dataset.load(folders, split) for split in ("train", "validation"))
+    training, validation = (
+        dataset.load_drives(folders, split) for split in ("train", "validation")
+    )
     config = FitConfig(updates=updates, weight_decay=0.05, trainable=("network",))
     windows = WindowConfig(context=8, weights=(1.0, 1.0, 2.0))
     model = Recurrent()
@@ -121,7 +123,9 @@ def main() -> None:
     arguments.add_argument("--runs", type=Path, default=Path("runs"))
     chosen = arguments.parse_args()
     model, params = fitted(chosen.data, chosen.updates, chosen.runs)
-    test = TestWindows.of(*dataset.load(chosen.test, "test"), context=16, horizon=16, stride=16)
+    test = TestWindows.of(
+        *dataset.load_drives(chosen.test, "test"), context=16, horizon=16, stride=16
+    )
     errors = prediction.evaluate("recurrent", model, params, test)
     weights = sum(x.size for x in jax.tree.leaves(params.network))
     results = {

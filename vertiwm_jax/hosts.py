@@ -28,13 +28,6 @@ _LONGEST_PATH = 4096  # bytes
 _PATIENCE = 60  # seconds that a process waits for the others at its end, whatever ended it
 
 
-def command() -> str:
-    """NAME where `python -m vertiwm_jax.NAME` is what runs, or else nothing."""
-    package = f"{__package__}."
-    words = (word.removeprefix("-m") for word in sys.orig_argv)
-    return next((w.removeprefix(package) for w in words if w.startswith(package)), "")
-
-
 def join(command: str) -> None:
     """Joins this process, which runs a command, with others if the environment says so.
 

@@ -198,7 +198,7 @@ def test_error_is_found_where_it_is():
 
 
 def test_the_built_in_simulator_beats_both_baselines_on_chrono_drives():
-    drives, terrain = dataset.load(DRIVES, "train")
+    drives, terrain = dataset.load_drives(DRIVES, "train")
     test = TestWindows.of(drives, terrain, context=16, horizon=16, stride=16)
     vehicle = hmmwv()
     models = (

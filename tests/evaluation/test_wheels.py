@@ -27,7 +27,7 @@ def test(tmp_path_factory):
     for kind in ("deformable", "maps"):
         (folder / kind).mkdir()
         shutil.copy(OPEN / kind / "deformable_001.npz", folder / kind)
-    drives, terrain = dataset.load(folder / "deformable", "test")
+    drives, terrain = dataset.load_drives(folder / "deformable", "test")
     found = TestWindows.of(drives, terrain, context=8, horizon=4, stride=40)
     assert np.all(np.asarray(found.windows.ground) == 1)
     return found

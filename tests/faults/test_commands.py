@@ -43,7 +43,7 @@ def maps(folder, size, count=1):
 @fault(DataError, "the split is by number, so that few drives are all trained on")
 def test_few_drives_are_split_by_share(tmp_path):
     recordings.write(tmp_path, **recordings.drives(count=10))
-    found = [dataset.load(tmp_path, split)[0].state for split in dataset.SPLITS]
+    found = [dataset.load_drives(tmp_path, split)[0].state for split in dataset.SPLITS]
     # The speed tells the drive.
     speeds = np.concatenate([np.asarray(state)[:, 0, 6] for state in found])
     np.testing.assert_allclose(np.sort(speeds), 1 + 0.1 * np.arange(10), rtol=1e-6)

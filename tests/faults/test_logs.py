@@ -72,7 +72,7 @@ def arguments(folder, source, output, settings=None):
 def imported(folder, source, output, settings=None):
     """The states of the drives that the command makes of a log."""
     door("import_drives")(arguments(folder, source, output, settings))
-    return np.asarray(dataset.load(output, "train")[0].state)
+    return np.asarray(dataset.load_drives(output, "train")[0].state)
 
 
 def left_out(said):

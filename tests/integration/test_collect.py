@@ -64,7 +64,7 @@ def contents(folder):
 
 
 def test_drives_are_read_as_recorded(collected, maps):
-    drives, terrain = dataset.load(collected, "train")
+    drives, terrain = dataset.load_drives(collected, "train")
     assert drives.state.shape == (40, STEPS + 1, 12) and terrain.worlds == 2
     assert np.all(drives.length == STEPS)
     np.testing.assert_array_equal(terrain.elevation, files.load_map(maps).elevation)
@@ -77,7 +77,7 @@ def test_drives_are_read_as_recorded(collected, maps):
     assert (meta["map"], meta["world"], meta["simulator"]) == ("world_001.npz", 1, "builtin")
     # No two drives are the same.
     assert len(np.unique(drives.state[:, 0, 0])) == 40
-    assert len(dataset.load(collected, "test")[0].state) == 2
+    assert len(dataset.load_drives(collected, "test")[0].state) == 2
 
 
 def test_going_on_is_as_if_never_stopped(collected, maps, tmp_path, monkeypatch, capsys):
@@ -295,7 +295,7 @@ def test_a_rover_drives_at_full_size(maps, tmp_path):
     (tmp_path / "maps").mkdir()
     files.save(flat, tmp_path / "maps" / "map.npz")
     run(tmp_path / "maps", tmp_path / "drives", "--vehicle", "rover", "--drives", "1")
-    drives, terrain = dataset.load(tmp_path / "drives", "train")
+    drives, terrain = dataset.load_drives(tmp_path / "drives", "train")
     assert terrain.resolution == 10.0 and np.all(terrain.elevation == 3.0)
     rover = vehicle.load("rover").vehicle
     _, meta = schema.read(tmp_path / "drives" / "world_000.npz")

@@ -203,7 +203,7 @@ def random_bits(leaf):
 
 def test_fitting_on_two_devices_is_fitting_on_one(two):
     config = WindowConfig(batch=16, context=2, horizon=4, validation=9)
-    drives, terrain = dataset.load([OPEN / "rigid"], "validation")
+    drives, terrain = dataset.load_drives([OPEN / "rigid"], "validation")
     drives = jax.tree.map(lambda x: x[:1], replace(drives, auxiliary=Auxiliary()))
     model, params = KinematicBicycle(), bicycle_of(hmmwv())
     data = WindowData.of(config, (drives, terrain), (drives, terrain))

@@ -74,7 +74,7 @@ def test_every_stage_leaves_its_metrics_and_all_together_a_model(run, folder):
         lines = runs.read_metrics(run / stage)
         assert [line["updates"] for line in lines] == [1, 2], stage
         assert all(np.isfinite(line["error"]) for line in lines), stage
-    drives, terrain = dataset.load(folder / "drives" / "deformable", "test")
+    drives, terrain = dataset.load_drives(folder / "drives" / "deformable", "test")
     state = VehicleState.from_vector(jnp.asarray(drives.state[0, 0]))
     commands = Command.from_vector(jnp.asarray(drives.control[0, :3]))
     ground = terrain.select(jnp.int32(0))

@@ -75,7 +75,7 @@ def test_a_log_becomes_a_collection(folder, seen, tmp_path, capsys):
     assert f"python -m vertiwm_jax.fit --data {tmp_path / 'drives'}" in out
     names = sorted(path.name for path in (tmp_path / "drives").iterdir())
     assert names == ["drives_000.npz", "drives_001.npz", "maps"]
-    drives, ground = dataset.load(tmp_path / "drives", "test")
+    drives, ground = dataset.load_drives(tmp_path / "drives", "test")
     np.testing.assert_array_equal(ground.elevation[0], terrain().elevation[0])
     assert drives.state.shape[0] == 3 and (np.asarray(drives.wheel_class) == GRASS).all()
     # Drive 22 begins where its share of all steps lies, and the others go on from there.
@@ -106,7 +106,7 @@ def test_a_bag_brings_its_own_ground(seen, tmp_path, capsys):
     out = capsys.readouterr().out
     assert "| - | 1 | " in out and "0% of the map had no height" in out
     assert "1 drives are too few for validation and test: expected 25 or more" in out
-    drives, ground = dataset.load(tmp_path / "drives", "train")
+    drives, ground = dataset.load_drives(tmp_path / "drives", "train")
     assert float(ground.elevation.min()) == pytest.approx(5 - 0.5 - 0.15, abs=1e-5)
     sand = ground.class_names.index("sand")
     assert (np.asarray(drives.wheel_class) == sand).all()
@@ -119,7 +119,7 @@ def test_what_was_left_out_is_told(folder, seen, tmp_path, capsys):
     write_csv(folder / "far.csv", replace(seen, position=seen.position + 15.0 * np.eye(3)[0]))
     run(*arguments(folder, tmp_path / "drives", "far.csv"), "--map", folder / "level.npz")
     out = capsys.readouterr().out
-    drives, _ = dataset.load(tmp_path / "drives", "train")
+    drives, _ = dataset.load_drives(tmp_path / "drives", "train")
     # x = 15 + 20 sin(0.15 t) is beyond 30 m while the sine is above 0.75.
     assert " off the map |" in out
     assert np.asarray(drives.state)[..., 0].max() <= 30
@@ -139,7 +139,7 @@ def test_velocities_of_another_frame_are_told_apart(folder, seen, tmp_path):
     assert "world.csv: velocity: expected to point where the positions go, found" in message
     config.save(replace(named, frames=Frames(velocity="world")), folder / "body.yaml")
     run(*argv, folder / "level.npz")
-    drives, _ = dataset.load(tmp_path / "drives", "train")
+    drives, _ = dataset.load_drives(tmp_path / "drives", "train")
     at = seen.time[0] + 0.1 * np.arange(drives.length[0] + 1)
     error = errors(np.asarray(drives.state[0])[: len(at)], at)
     assert np.abs(error[:, 6:9]).max() < 0.03

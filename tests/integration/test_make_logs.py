@@ -37,8 +37,8 @@ def test_logs_of_a_rover_are_imported_as_they_were_recorded(recorded, tmp_path, 
     said = capsys.readouterr().out
     assert "| 50.0 |" in said
     above = float(said.split("the body origin is ")[1].split()[0])
-    found, terrain = dataset.load(tmp_path / words.split("/")[-1], "train")
-    before, ground = dataset.load(recorded, "train")
+    found, terrain = dataset.load_drives(tmp_path / words.split("/")[-1], "train")
+    before, ground = dataset.load_drives(recorded, "train")
     height = np.asarray(query.height(ground, before.state[..., :2]))
     assert 10 * above == pytest.approx(np.median(before.state[..., 2] - height), abs=0.02)
     np.testing.assert_allclose(terrain.elevation, ground.elevation, rtol=1e-5)

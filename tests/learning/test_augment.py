@@ -147,7 +147,7 @@ def test_some_are_mirrored_and_the_others_left_alone(both):
 
 
 def test_the_simulator_drives_the_mirror_image_of_what_it_drives():
-    drives, terrain = dataset.load(DRIVES, "train")
+    drives, terrain = dataset.load_drives(DRIVES, "train")
     windows = gather(drives, index(drives, terrain, context=C, horizon=16, stride=20))
     both = augment.with_mirrored(terrain)
     simulator, params = Simulator(), chrono_like(hmmwv())

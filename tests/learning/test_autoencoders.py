@@ -27,7 +27,7 @@ CONFIG = AutoencoderConfig(batch=4, validation=8)
 
 @pytest.fixture(scope="module")
 def recorded():
-    return dataset.load(DRIVES, "train")
+    return dataset.load_drives(DRIVES, "train")
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from vertiwm_jax.world_model import motion
 
 def loaded(folder, **changes):
     write(folder, **changes)
-    return dataset.load(folder, "train")[0]
+    return dataset.load_drives(folder, "train")[0]
 
 
 def test_valid_steps_have_zero_mean_and_unit_deviation(tmp_path):

@@ -32,8 +32,8 @@ def test_compact_drives_are_the_recorded_ones_to_half_a_step(tmp_path):
     source = collections(tmp_path / "raw")
     compact.write(source, tmp_path / "compact")
     kinds = ("rigid", "mixed")
-    ours, our_maps = dataset.load([tmp_path / "compact" / kind for kind in kinds], "train")
-    theirs, their_maps = dataset.load([source / kind for kind in kinds], "train")
+    ours, our_maps = dataset.load_drives([tmp_path / "compact" / kind for kind in kinds], "train")
+    theirs, their_maps = dataset.load_drives([source / kind for kind in kinds], "train")
     places = windows.index(theirs, their_maps, context=4, horizon=4)
     ours, theirs = (windows.gather(drives, places) for drives in (ours, theirs))
     arrays = {"state": (ours.state, theirs.state), "control": (ours.control, theirs.control)}
@@ -72,7 +72,9 @@ def test_the_same_drives_give_the_same_bytes(tmp_path):
 def test_compacting_again_changes_no_number(tmp_path):
     compact.write(collections(tmp_path / "raw"), tmp_path / "once")
     compact.write(tmp_path / "once", tmp_path / "twice")
-    once, twice = (dataset.load(tmp_path / name / "rigid", "train") for name in ("once", "twice"))
+    once, twice = (
+        dataset.load_drives(tmp_path / name / "rigid", "train") for name in ("once", "twice")
+    )
     jax.tree.map(np.testing.assert_array_equal, once[0], twice[0])
     np.testing.assert_array_equal(once[1].elevation, twice[1].elevation)
 
@@ -96,7 +98,7 @@ def test_the_shipped_drives_are_whole():
     sizes = [file.stat().st_size for file in SHIPPED.rglob("*") if file.is_file()]
     assert sum(sizes) < 25e6
     for split, count in (("train", 20), ("validation", 2), ("test", 3)):
-        drives, terrain = dataset.load([SHIPPED / kind for kind in KINDS], split)
+        drives, terrain = dataset.load_drives([SHIPPED / kind for kind in KINDS], split)
         assert terrain.worlds == 48
         np.testing.assert_array_equal(drives.world, np.repeat(np.arange(48), count))
         assert drives.state.shape == (48 * count, 251, 12)

@@ -18,7 +18,7 @@ from vertiwm_jax.terrain.map import MapError
 def test_a_split_is_its_drives_of_every_file(tmp_path, split, first, count):
     write(tmp_path, "b.npz", length=np.full(25, STEPS - 1, np.int32))
     write(tmp_path, "a.npz")
-    loaded, terrain = dataset.load(tmp_path, split)
+    loaded, terrain = dataset.load_drives(tmp_path, split)
     assert terrain.worlds == 2
     np.testing.assert_array_equal(loaded.world, np.repeat([0, 1], count))
     np.testing.assert_array_equal(loaded.length, np.repeat([STEPS, STEPS - 1], count))
@@ -36,24 +36,24 @@ def test_a_map_beside_the_collection_is_found(tmp_path):
     collection.mkdir()
     write(collection)
     (collection / "maps").rename(tmp_path / "maps")
-    _, terrain = dataset.load(collection, "test")
+    _, terrain = dataset.load_drives(collection, "test")
     assert terrain.worlds == 1
 
 
 def test_an_empty_folder_and_an_empty_split_are_refused(tmp_path):
     with pytest.raises(DataError, match=r"expected a folder with \.npz files"):
-        dataset.load(tmp_path, "test")
+        dataset.load_drives(tmp_path, "test")
     write(tmp_path, **drives(count=3))
     with pytest.raises(DataError, match="expected drives 22 to 24 of a file"):
-        dataset.load(tmp_path, "test")
-    loaded, _ = dataset.load(tmp_path, "train")
+        dataset.load_drives(tmp_path, "test")
+    loaded, _ = dataset.load_drives(tmp_path, "train")
     assert len(loaded.length) == 3
 
 
 def test_drives_of_unequal_length_are_padded(tmp_path):
     write(tmp_path, "a.npz", **drives(steps=30), **auxiliary(steps=30))
     write(tmp_path, "b.npz", **auxiliary())
-    loaded, _ = dataset.load(tmp_path, "test")
+    loaded, _ = dataset.load_drives(tmp_path, "test")
     assert loaded.length.tolist() == [30, 30, 30, STEPS, STEPS, STEPS]
     assert loaded.state.shape == (6, STEPS + 1, 12)
     assert loaded.control.shape == (6, STEPS, 2)
@@ -65,7 +65,7 @@ def test_drives_of_unequal_length_are_padded(tmp_path):
 def test_what_was_recorded_beside_the_states_comes_along(tmp_path):
     recorded = auxiliary()
     write(tmp_path, **{name: recorded[name] for name in ("wheel_omega", "chassis_force")})
-    loaded, _ = dataset.load(tmp_path, "validation")
+    loaded, _ = dataset.load_drives(tmp_path, "validation")
     np.testing.assert_array_equal(loaded.auxiliary.wheel_omega, recorded["wheel_omega"][20:22])
     np.testing.assert_array_equal(loaded.auxiliary.chassis_force, recorded["chassis_force"][20:22])
     assert loaded.auxiliary.wheel_sinkage is None
@@ -79,14 +79,14 @@ def test_half_a_recording_is_refused(tmp_path):
     with pytest.raises(
         DataError, match=r"wheel_omega: expected in all files .* missing in 1 of 2"
     ) as caught:
-        dataset.load(tmp_path, "train")
+        dataset.load_drives(tmp_path, "train")
     assert str(caught.value).startswith(f"{path}: ")
 
 
 def test_precision_in_the_file_does_not_matter(tmp_path):
     write(tmp_path, "a.npz", state=drives()["state"].astype(np.float64))
     write(tmp_path, "b.npz", state=drives()["state"].astype(np.float16))
-    loaded, _ = dataset.load(tmp_path, "train")
+    loaded, _ = dataset.load_drives(tmp_path, "train")
     assert loaded.state.dtype == np.float32
     np.testing.assert_allclose(loaded.state[:20], loaded.state[20:], rtol=1e-3)
 
@@ -101,7 +101,7 @@ def test_missing_classes_are_those_of_the_map_under_the_wheels(tmp_path):
     write(tmp_path, state=state, wheel_class=None, meta=meta)
     semantic = np.where(np.arange(4) < 2, GRASS, SNOW) * np.ones((4, 1), int)
     files.save(terrain_map.build(np.ones((9, 9)), semantic), tmp_path / "maps" / "hill.npz")
-    loaded, _ = dataset.load(tmp_path, "test")
+    loaded, _ = dataset.load_drives(tmp_path, "test")
     east = state[22:, :, None, 0] - (np.array(wheels) @ [1, 1]) / np.sqrt(2)
     np.testing.assert_array_equal(loaded.wheel_class, np.where(east < 0, GRASS, SNOW))
 
@@ -113,7 +113,7 @@ def test_collections_are_loaded_together(tmp_path):
         write(tmp_path / name, "b.npz")
         hill = terrain_map.build(np.full((9, 9), height), np.full((4, 4), GRASS))
         files.save(hill, tmp_path / name / "maps" / "hill.npz")
-    loaded, terrain = dataset.load([tmp_path / "rigid", tmp_path / "mixed"], "test")
+    loaded, terrain = dataset.load_drives([tmp_path / "rigid", tmp_path / "mixed"], "test")
     np.testing.assert_array_equal(loaded.world, np.repeat([0, 1, 2, 3], 3))
     np.testing.assert_array_equal(terrain.elevation[:, 0, 0], [1, 1, 2, 2])
 
@@ -129,26 +129,5 @@ def test_collections_of_other_classes_are_refused(tmp_path):
     moss = terrain_map.build(np.ones((9, 9)), np.full((4, 4), GRASS), classes=classes)
     files.save(moss, tmp_path / "own" / "maps" / "hill.npz")
     with pytest.raises(MapError, match="class_names: expected") as caught:
-        dataset.load([tmp_path / "own", tmp_path / "standard"], "test")
+        dataset.load_drives([tmp_path / "own", tmp_path / "standard"], "test")
     assert str(caught.value).startswith(f"map of {path}: ")
-
-
-def test_every_nth_world_is_held_out_whole(tmp_path):
-    for name in "abcde":
-        write(tmp_path, f"{name}.npz", **auxiliary())
-    loaded, _ = dataset.load(tmp_path, "train")
-    kept, left = dataset.split_worlds(loaded, every=2)
-    np.testing.assert_array_equal(kept.world, np.repeat([0, 2, 4], 20))
-    np.testing.assert_array_equal(left.world, np.repeat([1, 3], 20))
-    assert left.state.shape == (40, STEPS + 1, 12)
-    np.testing.assert_array_equal(left.auxiliary.wheel_omega[:20], auxiliary()["wheel_omega"][:20])
-    assert left.auxiliary.steer_angle.shape[0] == 40
-
-
-@pytest.mark.parametrize("every", [1, 3])
-def test_a_split_of_worlds_with_an_empty_side_is_refused(tmp_path, every):
-    write(tmp_path, "a.npz")
-    write(tmp_path, "b.npz")
-    loaded, _ = dataset.load(tmp_path, "train")
-    with pytest.raises(DataError, match="worlds or more to hold out"):
-        dataset.split_worlds(loaded, every)

@@ -29,7 +29,7 @@ BICYCLE = KinematicBicycle()
 
 @pytest.fixture(scope="module")
 def recorded():
-    return dataset.load(DRIVES, "train")
+    return dataset.load_drives(DRIVES, "train")
 
 
 @pytest.fixture(scope="module")

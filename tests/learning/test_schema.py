@@ -88,7 +88,7 @@ def test_a_defect_is_one_error_that_names_file_and_field(tmp_path, defect):
     changes, message = DEFECTS[defect]
     path = write(tmp_path, **changes)
     with pytest.raises(DataError, match=message) as caught:
-        dataset.load(tmp_path, "test")
+        dataset.load_drives(tmp_path, "test")
     assert str(caught.value).startswith(f"{path}: ")
 
 
@@ -97,19 +97,19 @@ def test_values_after_the_end_of_a_drive_are_not_looked_at(tmp_path):
     length[3] = 6
     state, sinkage = broken("state", (3, 7), np.nan), spoilt("wheel_sinkage", np.nan)
     write(tmp_path, state=state, wheel_sinkage=sinkage, length=length)
-    dataset.load(tmp_path, "train")
+    dataset.load_drives(tmp_path, "train")
 
 
 def test_a_vehicle_that_stands_still_tells_no_scale(tmp_path):
     write(tmp_path, state=np.zeros((25, STEPS + 1, 12)))
-    dataset.load(tmp_path, "train")
+    dataset.load_drives(tmp_path, "train")
 
 
 @pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04 cut off"])
 def test_a_corrupt_file_is_named(tmp_path, content):
     (tmp_path / "a.npz").write_bytes(content)
     with pytest.raises(DataError, match=r"a\.npz: expected an \.npz archive"):
-        dataset.load(tmp_path, "test")
+        dataset.load_drives(tmp_path, "test")
 
 
 def test_a_truncated_file_is_named(tmp_path):
@@ -117,14 +117,14 @@ def test_a_truncated_file_is_named(tmp_path):
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(DataError, match=r"a\.npz: expected an \.npz archive"):
-        dataset.load(tmp_path, "test")
+        dataset.load_drives(tmp_path, "test")
 
 
 def test_an_array_instead_of_an_archive_is_named(tmp_path):
     with (tmp_path / "a.npz").open("wb") as file:
         np.save(file, np.zeros(3))
     with pytest.raises(DataError, match=r"a\.npz: expected an \.npz archive"):
-        dataset.load(tmp_path, "test")
+        dataset.load_drives(tmp_path, "test")
 
 
 @pytest.mark.parametrize("write_archive", [np.savez, np.savez_compressed])

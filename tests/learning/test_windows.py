@@ -14,7 +14,7 @@ def test_windows_hold_consecutive_steps_within_the_valid_ones(tmp_path):
     length = np.full(25, STEPS, np.int32)
     length[23] = 21
     write(tmp_path, length=length)
-    loaded, terrain = dataset.load(tmp_path, "test")
+    loaded, terrain = dataset.load_drives(tmp_path, "test")
     windows = gather(loaded, index(loaded, terrain, context=12, horizon=8, stride=5))
     # (40 - 20) // 5 + 1 of the drives of 40 steps, one of the drive of 21.
     speeds = np.asarray(windows.state[:, 0, 6])
@@ -35,14 +35,14 @@ def test_ground_of_a_window_is_that_under_its_predicted_steps(tmp_path):
     classes[24, :11] = SNOW  # Context only.
     classes[22, 15:, 0] = SNOW
     write(tmp_path, wheel_class=classes)
-    loaded, terrain = dataset.load(tmp_path, "test")
+    loaded, terrain = dataset.load_drives(tmp_path, "test")
     windows = gather(loaded, index(loaded, terrain, context=12, horizon=8, stride=100))
     assert [GROUNDS[i] for i in windows.ground] == ["transition", "deformable", "rigid"]
 
 
 def test_drives_shorter_than_a_window_are_refused(tmp_path):
     write(tmp_path)
-    loaded, terrain = dataset.load(tmp_path, "test")
+    loaded, terrain = dataset.load_drives(tmp_path, "test")
     with pytest.raises(DataError, match="at least 60 steps, found at most 40"):
         gather(loaded, index(loaded, terrain, context=30, horizon=30))
 
@@ -50,7 +50,7 @@ def test_drives_shorter_than_a_window_are_refused(tmp_path):
 def test_windows_hold_what_was_recorded_beside_the_states(tmp_path):
     recorded = auxiliary()
     write(tmp_path, wheel_force=recorded["wheel_force"], steer_angle=recorded["steer_angle"])
-    loaded, terrain = dataset.load(tmp_path, "test")
+    loaded, terrain = dataset.load_drives(tmp_path, "test")
     windows = gather(loaded, index(loaded, terrain, context=12, horizon=8, stride=20))
     force = recorded["wheel_force"][22:]
     expected = np.stack([force[d, s : s + 21] for d in range(3) for s in (0, 20)])
@@ -62,7 +62,7 @@ def test_windows_hold_what_was_recorded_beside_the_states(tmp_path):
 def test_a_gathered_batch_is_those_windows_of_all(tmp_path):
     write(tmp_path, "a.npz", **auxiliary())
     write(tmp_path, "b.npz", **auxiliary())
-    loaded, terrain = dataset.load(tmp_path, "train")
+    loaded, terrain = dataset.load_drives(tmp_path, "train")
     every = gather(loaded, index(loaded, terrain, context=6, horizon=4))
     places = prediction_windows.index(loaded, terrain, context=6, horizon=4)
     rows = jnp.array([300, 0, 7, 7])

@@ -17,7 +17,7 @@ MIXED = Path(__file__).parents[2] / "data" / "open" / "mixed"
 
 @pytest.fixture(scope="module")
 def windows():
-    drives, terrain = dataset.load(MIXED, "test")
+    drives, terrain = dataset.load_drives(MIXED, "test")
     return TestWindows.of(drives, terrain, context=16, horizon=16, stride=32)
 
 

@@ -1,6 +1,6 @@
 """`vertiwm compare`: train policies in several models and judge them all alike."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -29,8 +29,7 @@ from vertiwm_jax.simulators.processes import Map
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.training import keep_compiled
 
-Policies = Callable[[TerrainMap], Mapping[str, Policy | Agent]]
-"""Policies that drive on any worlds of one kind of map."""
+Policies = Mapping[str, Policy | Agent]
 
 
 @dataclass(frozen=True)
@@ -130,7 +129,7 @@ def _judge_all(
     first = settings[config.rows[0]]
     terrain = suites.suite_worlds(config.grounds, key, first.driven.scale)
     rows = [(settings[row], _learned(row, settings[row], folders[row])) for row in config.rows]
-    rows.append((first, lambda _: first.baselines))
+    rows.append((first, first.baselines))
     judged = {}
     for simulator in config.simulators:
         with processes.simulating(config.jobs) as mapped:
@@ -145,12 +144,8 @@ def _judge_all(
 
 def _learned(row: Row, settings: TrainConfig, folder: Path) -> Policies:
     """The policies of a training, by their names in the table."""
-
-    def restored(terrain: TerrainMap) -> dict[str, Policy | Agent]:
-        found = experiment.learned(settings, folder)
-        return {name.replace(row.algorithm, str(row), 1): x for name, x in found.items()}
-
-    return restored
+    found = experiment.learned(settings, folder)
+    return {name.replace(row.algorithm, str(row), 1): x for name, x in found.items()}
 
 
 def _judge(
@@ -167,7 +162,7 @@ def _judge(
         test = external.test_in(simulator, settings, terrain)
         judge = external.judge_in(simulator, settings, terrain, mapped)
         key = settings.key("testing")
-        driven = report.drive(test.env, test.params, policies(terrain), key, judge)
+        driven = report.drive(test.env, test.params, policies, key, judge)
         for suite, results in driven.items():
             groups.setdefault(suite, {}).update(results)
     return dict(groups)

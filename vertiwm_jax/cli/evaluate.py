@@ -190,7 +190,7 @@ def run(name: str, words: Sequence[str]) -> None:
 
 
 def _predict(command: Prediction) -> None:
-    drives, terrain = dataset.load(command.data, command.split)
+    drives, terrain = dataset.load_drives(command.data, command.split)
     longest = max(command.horizon)
     test = TestWindows.of(drives, terrain, command.context, longest, command.stride)
     driven = vehicle.load(command.vehicle).vehicle
@@ -220,7 +220,7 @@ def _predict(command: Prediction) -> None:
 
 
 def _adapt(command: Adaptation) -> None:
-    drives, terrain = dataset.load(command.data, command.split)
+    drives, terrain = dataset.load_drives(command.data, command.split)
     drives = jax.tree.map(lambda x: x[:: command.every], drives)
     index = adaptation.windows_on_soil(drives, terrain)
     model, params = load_model(command.model, command.weights, soil="map", exact_gradient=True)
@@ -235,7 +235,7 @@ def _adapt(command: Adaptation) -> None:
 def _calibrate(command: Calibration) -> None:
     lengths = command.context, command.horizon, command.horizon
     measured, tested = (
-        TestWindows.of(*dataset.load(command.data, split), *lengths)
+        TestWindows.of(*dataset.load_drives(command.data, split), *lengths)
         for split in ("validation", "test")
     )
     model = load_model("vertiwm", command.weights)

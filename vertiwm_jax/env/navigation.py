@@ -202,11 +202,6 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         """Whether only the time is over: the value of the state that follows still counts."""
         return state.ending == TerminationReason.TIMED_OUT
 
-    @property
-    def num_actions(self) -> int:
-        """Speed and steering."""
-        return 2
-
     def action_space(self, params: TaskParams | None = None) -> spaces.Box:
         """[-1, 1]^2."""
         return spaces.Box(-1.0, 1.0, (2,), jnp.float32)

@@ -64,12 +64,23 @@ class Drives:
     auxiliary: Auxiliary
 
 
-def load(folders: str | Path | Sequence[str | Path], split: Split) -> tuple[Drives, TerrainMap]:
-    """One split of one or several collections, with the maps of all their files stacked.
+def load_drives(
+    folders: str | Path | Sequence[str | Path], split: Split = "train"
+) -> tuple[Drives, TerrainMap]:
+    """Loads recorded drives, and the maps that they were driven on.
 
-    Drives of unequal length are padded to the longest. Auxiliary arrays must be in all files or
-    in none. Raises `DataError` on malformed drives, `MapError` on maps that are malformed or
-    differ in extent or classes; both name the file.
+    Args:
+        folders: a folder of `.npz` files of drives, or several.
+        split: which drives of each file: `train`, `validation` or `test`.
+
+    Returns:
+        D drives at 10 Hz, of T steps at most: states `[D, T + 1, 12]` (position in m and roll,
+        pitch, yaw in rad in the frame of the world, velocity and angular velocity in that of the
+        body), commands `[D, T, 2]` (m/s, rad). And W worlds, of which `world` `[D]` is driven on.
+
+    Raises:
+        DataError: a file is malformed, or has too few drives for this split.
+        MapError: a map is missing, malformed, or differs from the others in extent or classes.
     """
     paths: list[Path] = []
     parts: list[dict[str, np.ndarray]] = []
@@ -94,46 +105,11 @@ def load(folders: str | Path | Sequence[str | Path], split: Split) -> tuple[Driv
     return _join(paths, parts), stack(maps, [f"map of {path}" for path in paths])
 
 
-def load_drives(
-    folders: str | Path | Sequence[str | Path], split: Split = "train"
-) -> tuple[Drives, TerrainMap]:
-    """Loads recorded drives, and the maps that they were driven on.
-
-    Args:
-        folders: a folder of `.npz` files of drives, or several.
-        split: which drives of each file: `train`, `validation` or `test`.
-
-    Returns:
-        D drives at 10 Hz, of T steps at most: states `[D, T + 1, 12]` (position in m and roll,
-        pitch, yaw in rad in the frame of the world, velocity and angular velocity in that of the
-        body), commands `[D, T, 2]` (m/s, rad). And W worlds, of which `world` `[D]` is driven on.
-
-    Raises:
-        DataError: a file is malformed, or has too few drives for this split.
-        MapError: a map is missing, malformed, or differs from the others in extent or classes.
-    """
-    return load(folders, split)
-
-
 def load_file(path: Path) -> tuple[Drives, TerrainMap]:
     """All drives of one file, with its map; raises like `load`."""
     arrays, terrain = _read(path)
     world = np.zeros(len(arrays["length"]), np.int32)
     return _join([path], [{**arrays, "world": world}]), terrain
-
-
-def split_worlds(drives: Drives, every: int) -> tuple[Drives, Drives]:
-    """The drives without those on every `every`-th world, and those on them.
-
-    Worlds are numbered over all collections that were loaded together; every 8th of collections
-    of 16 takes two from each. Raises `DataError` when a side would be empty.
-    """
-    held_out = np.asarray(drives.world) % every == every - 1
-    if held_out.all() or not held_out.any():
-        worlds = len(np.unique(drives.world))
-        raise DataError(f"expected {max(every, 2)} worlds or more to hold out one, found {worlds}")
-    kept, left = (jax.tree.map(lambda x, m=mask: x[m], drives) for mask in (~held_out, held_out))
-    return kept, left
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], TerrainMap]:

@@ -135,7 +135,7 @@ def fit(
 
     folders: of drives, or of folders of drives named like `KINDS`; reuse: of other runs, whose
     stages are taken over where their inputs are the same; start: parameters to go on from, by
-    open-loop predictions alone. Raises what `dataset.load`, `WindowData.of` and `fitting.fit`
+    open-loop predictions alone. Raises what `load_drives`, `WindowData.of` and `fitting.fit`
     raise.
     """
     driven = config.driven
@@ -297,7 +297,7 @@ class _Pipeline:
         """Drives of these kinds in all folders, and of folders that are not divided into kinds."""
         key = tuple(kinds), split
         if key not in self.loaded:
-            drives, terrain = dataset.load(self._folders(kinds), split)
+            drives, terrain = dataset.load_drives(self._folders(kinds), split)
             self.loaded[key] = replace(drives, auxiliary=Auxiliary()), terrain
         return self.loaded[key]
 
