@@ -37,7 +37,9 @@ def terrain():
 def stepped(config, dynamics, params, terrain, encoders=None):
     """Environment, and observation and state after a step at full speed."""
     env = NavigationEnv(dynamics, config)
-    params = env.make_params(params, terrain, task((-5.0, 3.0), (30.0, 20.0), yaw=0.4), encoders)
+    params = env.make_params(
+        params, terrain, task((-5.0, 3.0), (30.0, 20.0), yaw=0.4), encoders=encoders
+    )
     assert params.start_observation.shape == (1, *env.observation_space().shape)
     _, state = env.start(params, 0)
     step = jax.jit(partial(env.step_env, jax.random.key(0)))

@@ -50,7 +50,8 @@ def test_layout_and_units():
     np.testing.assert_allclose(seen[observation.GOAL], [0.4, 1.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(seen[11:13], action)
 
-    layout = observation.LAYOUT
+    layout = observation.ObservationSpec().parts
+    assert observation.ObservationSpec().size == len(seen)
     places = [np.arange(len(seen))[part.where] for part in layout.values()]
     assert sorted(np.concatenate(places)) == list(range(len(seen)))
     named = {name: (seen[part.where] * part.scale).tolist() for name, part in layout.items()}

@@ -171,7 +171,7 @@ def environment() -> Numbers:
     env = NavigationEnv(dynamics, NavigationConfig(embeddings=True))
     xy, yaw = (jnp.asarray(STARTS[::2, columns], jnp.float32) for columns in ([0, 1], 5))
     pool = Tasks(jnp.zeros(len(xy), jnp.int32), xy, yaw, goal=-xy)
-    params = env.make_params(weights, ground(), pool, load_encoders())
+    params = env.make_params(weights, ground(), pool, encoders=load_encoders())
     states, rewards = params.starts, []
     step = jax.jit(jax.vmap(env.step_env, (None, 0, 0, None)))
     actions = jnp.array([[1.0, -0.5], [0.5, 0.2], [0.0, 0.0], [-0.5, 1.0]])

@@ -196,12 +196,10 @@ def test_the_observation_of_map_arrays(size, sighted):
     straight = route.straight(config.route, terrain, goal[None, :2])
     np.testing.assert_allclose(find_none(*arrays, goal), straight.cost[0], rtol=1e-6)
     assert (way >= straight.cost[0] - 1e-3).all() and (way > 1.5 * straight.cost[0]).any()
-    expected = jax.jit(observation.observe, static_argnums=1)(
-        terrain, hmmwv(), state, goal, routes, action
-    )
+    latents = jax.jit(embed)(encoders, terrain, state) if encoders else None
+    expected = jax.jit(observation.observe)(terrain, hmmwv(), state, goal, routes, action, latents)
     assert 0 < (observation.arcs_ahead(expected)[1] == 7.5).sum() < 72
     if encoders:
-        expected = observation.with_embedding(expected, jax.jit(embed)(encoders, terrain, state))
         assert float(jnp.std(expected[OBSERVATION_SIZE:])) > 0.1
     found = observe(*arrays, way, state.vector, goal, action)
     np.testing.assert_allclose(found, expected, atol=1e-5)

@@ -1,7 +1,6 @@
 """A learned policy in plain numbers: what `policy.json` says of it, and its weights."""
 
 import dataclasses
-import math
 from typing import Any
 
 import jax
@@ -11,7 +10,7 @@ import numpy as np
 import vertiwm_jax
 from vertiwm_jax.env import observation
 from vertiwm_jax.env.controllers import REFERENCE, LookAhead, StraightToGoal
-from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, LAYOUT, Part
+from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, ObservationSpec, Part
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.traversability import TraversabilityCost
 from vertiwm_jax.mechanics.vehicle import Vehicle
@@ -36,19 +35,16 @@ def about(
     places, heading = observation.poses_ahead(vehicle)
     still = Command(jnp.float32(0), jnp.float32(0))
     base = policy.base if isinstance(policy, Corrected) else None
-    size, parts = observation.OBSERVATION_SIZE, LAYOUT
     image = _learned(policy).actor.senses.image
-    if image:
-        pixels = slice(size, size + math.prod(image))
-        size, parts = pixels.stop, {**parts, "embedding": Part(pixels, "1", 1.0)}
+    seen = ObservationSpec(image=image is not None)
     return {
         "vertiwm_jax": vertiwm_jax.__version__,
         "step_seconds": STEP_SECONDS,
         "held_while_learning": held,
         "observation": {
-            "size": size,
+            "size": seen.size,
             "limit": observation.OBSERVATION_LIMIT,
-            "parts": {name: _part(part) for name, part in parts.items()},
+            "parts": {name: _part(part) for name, part in seen.parts.items()},
             "places": np.column_stack([places, heading]).tolist(),
             "class_places": observation.CLASS_PLACES.tolist(),
         },

@@ -56,10 +56,8 @@ def _observe(driven: Vehicle, encoders: Encoders | None, *arguments: jax.Array) 
     *arrays, cost, state, goal, action = arguments
     terrain, vehicle = _terrain(*arrays), VehicleState.from_vector(state)
     route = Routes(cost[None], jnp.int32(0))
-    seen = observation.observe(terrain, driven, vehicle, goal, route, action)
-    if encoders is None:
-        return seen
-    return observation.with_embedding(seen, embed(encoders, terrain, vehicle))
+    latents = embed(encoders, terrain, vehicle) if encoders else None
+    return observation.observe(terrain, driven, vehicle, goal, route, action, latents)
 
 
 def _terrain(

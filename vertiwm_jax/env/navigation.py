@@ -1,7 +1,6 @@
 """Goal navigation over any vehicle model, as a gymnax environment."""
 
 import dataclasses
-import math
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from vertiwm_jax.env.termination import TerminationReason, edge_distance, first_
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, hmmwv, load_vehicle
 from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
 from vertiwm_jax.networks.policy import Senses
-from vertiwm_jax.perception.features import EMBEDDING_SHAPE, Encoders
+from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.state import STEP_SECONDS, VehicleState
 from vertiwm_jax.terrain import obstacles, query, reveal
 from vertiwm_jax.terrain.map import TerrainMap
@@ -208,14 +207,13 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
 
     def observation_space(self, params: TaskParams | None = None) -> spaces.Box:
         """Every entry within the observation's limit."""
-        limit, size = observation.OBSERVATION_LIMIT, observation.OBSERVATION_SIZE
-        size += math.prod(self.senses.image or (0,))
+        limit, size = observation.OBSERVATION_LIMIT, self.config.observed.size
         return spaces.Box(-limit, limit, (size,), jnp.float32)
 
     @property
     def senses(self) -> Senses:
         """How networks should read observations."""
-        return Senses(observation.ARCS, EMBEDDING_SHAPE if self.config.embeddings else None)
+        return self.config.observed.senses
 
     @property
     def _pool(self) -> ResetPool:

@@ -4,6 +4,7 @@ Nothing is in world coordinates. So a policy cannot memorize a map, and an obser
 change when world and vehicle are moved or turned together.
 """
 
+import math
 from dataclasses import dataclass
 
 import jax
@@ -14,7 +15,8 @@ from vertiwm_jax.env.route import CLEARANCE, Routes
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.env.traversability import CROWN_SCALE, SLOPE_SCALE, TWIST_SCALE, footprint, places
 from vertiwm_jax.mechanics.vehicle import Vehicle
-from vertiwm_jax.networks.policy import Candidates, tiles
+from vertiwm_jax.networks.policy import Candidates, Senses, tiles
+from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -76,6 +78,34 @@ LAYOUT = {
 """The parts of the observation by name; -1 in the last two means off the map."""
 
 
+@dataclass(frozen=True)
+class ObservationSpec:
+    """Which parts an observation has, static.
+
+    image: whether it ends with the ground as encoders see it.
+    """
+
+    image: bool = False
+
+    @property
+    def parts(self) -> dict[str, Part]:
+        """What an observation holds, by name, in order."""
+        if not self.image:
+            return LAYOUT
+        pixels = slice(OBSERVATION_SIZE, OBSERVATION_SIZE + math.prod(EMBEDDING_SHAPE))
+        return {**LAYOUT, "embedding": Part(pixels, "1", 1.0)}
+
+    @property
+    def size(self) -> int:
+        """O, how many numbers an observation has."""
+        return max(part.where.stop for part in self.parts.values())
+
+    @property
+    def senses(self) -> Senses:
+        """How networks should read observations."""
+        return Senses(ARCS, EMBEDDING_SHAPE if self.image else None)
+
+
 def distance_and_bearing(position: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Distance `[...]` and horizontal unit vector `[..., 2]` to points `[..., 3]`."""
     offset = goal - position
@@ -133,8 +163,9 @@ def observe(
     goal: jax.Array,
     routes: Routes,
     action: jax.Array,
+    embedding: jax.Array | None = None,
 ) -> jax.Array:
-    """`[OBSERVATION_SIZE]` float32 seen by one vehicle on the selected world.
+    """`[O]` float32 seen by one vehicle on the selected world, in the parts of `ObservationSpec`.
 
     In order: roll, pitch; v_body; omega_body; distance to the goal, cosine and sine of its
     bearing; the last action; what the ground would do to the vehicle here and at places on nine
@@ -144,7 +175,8 @@ def observe(
     than from here, and here by how much more than its distance); friction and plate sinkage at
     some of the places, -1 off the map.
 
-    goal: `[3]` m; routes: to it; action: `[2]` in [-1, 1].
+    goal: `[3]` m; routes: to it; action: `[2]` in [-1, 1]; embedding: `EMBEDDING_SHAPE`, the ground
+    as encoders see it, which follows all else tile by tile, the order in which networks read it.
     """
     yaw = state.rpy[2]
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
@@ -188,15 +220,8 @@ def observe(
     classes = jnp.stack([below.friction, sinkage], axis=-1)
     classes = jnp.where((edge_distance(terrain, xy) >= 0)[:, None], classes, -1.0)
 
-    observation = jnp.concatenate([*motion, *ground, classes.ravel()])
-    return jnp.clip(observation, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
-
-
-def with_embedding(observation: jax.Array, embedding: jax.Array) -> jax.Array:
-    """The observation followed by a terrain embedding of `EMBEDDING_SHAPE`.
-
-    The embedding is stored tile by tile, the order in which networks read it.
-    """
-    # What a model sees where it has diverged may be anything.
-    clipped = jnp.clip(jnp.nan_to_num(embedding), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
-    return jnp.concatenate([observation, tiles(clipped).ravel()])
+    parts = [*motion, *ground, classes.ravel()]
+    if embedding is not None:
+        # What a model sees where it has diverged may be anything.
+        parts.append(tiles(jnp.nan_to_num(embedding)).ravel())
+    return jnp.clip(jnp.concatenate(parts), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)

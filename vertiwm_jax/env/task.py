@@ -11,6 +11,7 @@ from gymnax.environments import environment
 from vertiwm_jax.config import settings
 from vertiwm_jax.dynamics import History, Params, embedding
 from vertiwm_jax.env import observation, route
+from vertiwm_jax.env.observation import ObservationSpec
 from vertiwm_jax.env.randomization import DomainRandomization
 from vertiwm_jax.env.reward import RewardConfig
 from vertiwm_jax.env.route import RouteConfig, Routes
@@ -65,6 +66,11 @@ class NavigationConfig:
                 "reveal.range: expected inf with embeddings, which show all of the map, "
                 f"found {self.reveal.range:g}"
             )
+
+    @property
+    def observed(self) -> ObservationSpec:
+        """What policies see."""
+        return ObservationSpec(image=self.embeddings)
 
     def route_to(self, terrain: TerrainMap, vehicle: Vehicle, goal: jax.Array) -> Routes:
         """The vehicle's route to the goal `[2]`, m, in the selected world; can be compiled."""
@@ -148,15 +154,13 @@ def see(
     terrain: as far as the vehicle has seen it; routes: with that to its goal selected; encoders: of
     `TaskParams`. `ValueError` where there is nothing to see by.
     """
-    seen = observation.observe(terrain, vehicle, state.vehicle, state.goal, routes, state.action)
-    if not config.embeddings:
-        return seen
-    latents = embedding(state.history)
-    if latents is None:
+    latents = embedding(state.history) if config.embeddings else None
+    if config.embeddings and latents is None:
         if encoders is None:
             raise ValueError(
                 "embeddings: expected a model that was loaded with them, or encoders to see by, "
                 "found neither; see models.registry.load_encoders"
             )
         latents = embed(encoders, terrain, state.vehicle)
-    return observation.with_embedding(seen, latents)
+    own = state.vehicle, state.goal, routes, state.action
+    return observation.observe(terrain, vehicle, *own, latents)
