@@ -35,7 +35,7 @@ def test_the_built_in_simulator_outside_jit_is_that_inside(jobs):
     )
     config = NavigationConfig(speed_range=(0.0, 5.0), horizon_seconds=6.0, embeddings=True)
     env = NavigationEnv(Simulator(), config)
-    params = env.make_params(chrono_like(hmmwv()), terrain, tasks, load_encoders())
+    params = env.make_params(chrono_like(hmmwv()), terrain, tasks, encoders=load_encoders())
     arguments = env, params, jax.tree_util.Partial(led_by_embedding), jax.random.key(0)
     inside = run_episodes(*arguments)
     with processes.simulating(jobs) as mapped:

@@ -61,7 +61,7 @@ def test_descent_tells_two_soils_apart():
     first = float(PROBLEM.validate(now, worlds)["error"])
     for step in range(150):
         _, gradient = loss(now, worlds, jax.random.key(step))
-        assert not any(np.any(x) for x in jax.tree.leaves(gradient["encoders"]))
+        assert not any(np.any(x) for x in jax.tree.leaves(gradient["semantic"]))
         soil = jax.tree.map(lambda x, g: x - 0.3 * g, now["soil"], gradient["soil"])
         now = {**now, "soil": soil}
     assert float(PROBLEM.validate(now, worlds)["error"]) < 0.3 * first

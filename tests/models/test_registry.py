@@ -25,7 +25,7 @@ LEARNED = ("vertiwm", "transformer", "nesam")
 def drive(model, params, states):
     def of_one(state):
         history = model.init(params, TERRAIN, state)
-        return rollout(model, params, TERRAIN, history, state, COMMANDS)
+        return rollout(model, params, TERRAIN, state, COMMANDS, history)
 
     return jax.vmap(of_one)(states)
 
@@ -74,7 +74,7 @@ def test_commands_move_what_has_rounded_matrices():
     def away(model, params, commands):
         state = one(STATES, 0)
         history = model.init(params, TERRAIN, state)
-        return jnp.sum(rollout(model, params, TERRAIN, history, state, commands).position[-1])
+        return jnp.sum(rollout(model, params, TERRAIN, state, commands, history).position[-1])
 
     by_commands = jax.jit(jax.grad(away, argnums=2), static_argnums=0)
     expected, found = (
