@@ -152,7 +152,7 @@ def find(path: str | Path) -> Path:
     An unknown name raises `ConfigError`.
     """
     path = Path(path)
-    return path if path.suffix or path.exists() else default_config(str(path))
+    return path if path.suffix or path.is_file() else default_config(str(path))
 
 
 def load(cls: type[T], path: str | Path) -> T:
