@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from env.worlds import GRASS, SNOW, ground, hills
 
-from vertiwm_jax.env import render
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain import picture
 
 
 def test_hills_are_lit_from_the_north_west_and_classes_tinted():
@@ -14,11 +14,11 @@ def test_hills_are_lit_from_the_north_west_and_classes_tinted():
     ridge = np.broadcast_to(8 - np.abs(x - 64) / 8, (129, 129))  # runs south to north
     semantic = np.full((16, 16), GRASS)
     semantic[:8, :8] = SNOW
-    shaded = render.shaded(terrain_map.build(ridge, semantic), 0, enlarge=2)
+    shaded = picture.shaded(terrain_map.build(ridge, semantic), 0, enlarge=2)
     assert shaded.shape == (256, 256, 3) and shaded.min() >= 0 and shaded.max() <= 1
     assert shaded[200, 40].sum() > shaded[200, 216].sum()  # western flank, eastern flank
     assert shaded[40, 40, 2] > shaded[200, 40, 2] + 0.1  # snow north-west, grass south-west
-    turned = render.shaded(terrain_map.build(ridge.T, semantic), 0, enlarge=2)
+    turned = picture.shaded(terrain_map.build(ridge.T, semantic), 0, enlarge=2)
     assert turned[40, 200].sum() > turned[216, 200].sum()  # northern flank, southern flank
 
 

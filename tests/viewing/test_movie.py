@@ -5,14 +5,14 @@ import pytest
 from PIL import Image
 from viewing.scenes import bare, scene
 
+from vertiwm_jax import figures
 from vertiwm_jax.config import ConfigError
-from vertiwm_jax.evaluation import plots
 from vertiwm_jax.viewing import movie
 
 
 def test_what_moves_is_where_it_is():
     full = scene()
-    with plots.style():
+    with figures.style():
         figure, show = movie.draw(full)
     overhead, tilt, fusion = figure.axes
     for step in (0, 12, 20):

@@ -9,7 +9,7 @@ import jax
 import tyro
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import runs
+from vertiwm_jax import figures, runs
 from vertiwm_jax.adaptation.soil_filter import SoilFilter
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, settings
@@ -21,7 +21,6 @@ from vertiwm_jax.evaluation import (
     adaptation,
     calibration,
     external,
-    plots,
     prediction,
     prediction_report,
     report,
@@ -254,7 +253,7 @@ def _calibrate(command: Calibration) -> None:
         command.output.mkdir(parents=True, exist_ok=True)
         runs.write_atomic(command.output / "calibration.md", "\n\n".join(tables) + "\n")
         figure = calibration.picture(bounds[best], errors, order, nothing)
-        plots.save(figure, command.output / "calibration.png")
+        figures.save(figure, command.output / "calibration.png")
 
 
 def _compared(folders: Sequence[Path]) -> dict[str, tuple[Dynamics, Params]]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from vertiwm_jax import runs
+from vertiwm_jax import figures, runs
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.learning import experiment
@@ -33,4 +33,4 @@ def _draw(folder: Path) -> None:
     stages = [found.name for name in ROLLOUTS for found in sorted(folder.glob(name))]
     curves = {name: runs.read_columns(folder / name) for name in stages}
     figure = plots.learning_curves(curves, "updates", CURVES, "updates")
-    plots.save(figure, folder / "learning_curves.png")
+    figures.save(figure, folder / "learning_curves.png")

@@ -10,12 +10,12 @@ from pathlib import Path
 import jax
 import tyro
 
+from vertiwm_jax import figures
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import ConfigError, CountOrZero, settings
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.suites import Suite
 from vertiwm_jax.errors import UserError
-from vertiwm_jax.evaluation import plots
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.models.registry import ModelName, load_model
@@ -95,7 +95,7 @@ def _picture(command: View) -> Path:
         source / "maps.png" if source.is_dir() else source.with_suffix(".png")
     )
     files = sorted(source.glob("*.npz")) if source.is_dir() else [source]
-    plots.save(load_map(source).plot([file.stem for file in files] or None), path)
+    figures.save(load_map(source).plot([file.stem for file in files] or None), path)
     return path
 
 

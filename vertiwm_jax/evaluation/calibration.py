@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.evaluation.plots import line, sheet, style
 from vertiwm_jax.evaluation.prediction import TestWindows, predict
 from vertiwm_jax.evaluation.tables import markdown
+from vertiwm_jax.figures import line, sheet, style
 from vertiwm_jax.learning.schema import DataError
 
 if TYPE_CHECKING:

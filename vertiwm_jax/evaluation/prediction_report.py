@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
-from vertiwm_jax import runs
-from vertiwm_jax.evaluation import error_sources, plots, prediction, wheels
-from vertiwm_jax.evaluation.plots import line, sheet, style
+from vertiwm_jax import figures, runs
+from vertiwm_jax.evaluation import error_sources, prediction, wheels
 from vertiwm_jax.evaluation.prediction import (
     BATCH,
     MEASURES,
@@ -63,12 +62,12 @@ def write(
     runs.write_atomic(folder / "prediction.csv", runs.csv_text(lines))
 
     growth = {row.name: row.growth for row in rows[-1]}
-    plots.save(error_growth(growth, STEP_SECONDS), folder / "prediction.png")
-    plots.save(paths(_panels(test, error, predicted)), folder / "paths.png")
+    figures.save(error_growth(growth, STEP_SECONDS), folder / "prediction.png")
+    figures.save(paths(_panels(test, error, predicted)), folder / "paths.png")
     if read.coefficients is not None and (traces := crossings(test, read.coefficients)):
         seconds = STEP_SECONDS * np.arange(-AROUND, AROUND + 1)
         figure = coefficients(traces, COEFFICIENTS, seconds)
-        plots.save(figure, folder / "coefficients.png")
+        figures.save(figure, folder / "coefficients.png")
 
 
 def _panels(
@@ -143,12 +142,12 @@ def error_growth(
     growth: by model and then by kind, m after each step.
     """
     kinds = list(next(iter(growth.values())))
-    with style():
-        figure = sheet(3.2 * len(kinds), 2.8)
+    with figures.style():
+        figure = figures.sheet(3.2 * len(kinds), 2.8)
         panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
         for axes, kind in zip(panels, kinds, strict=True):
             for i, (name, by_kind) in enumerate(growth.items()):
-                colour, dash = line(i)
+                colour, dash = figures.line(i)
                 seconds = step_seconds * (1 + np.arange(len(by_kind[kind])))
                 axes.plot(seconds, by_kind[kind], dash, label=name, color=colour)
             axes.set(title=kind, xlabel="time [s]", xlim=(0, None), yscale="log")
@@ -162,13 +161,13 @@ def paths(panels: Sequence[tuple[str, Mapping[str, np.ndarray]]]) -> Figure:
 
     x is forward, drawn upwards, and y to the left. The first of each panel is the recorded one.
     """
-    with style():
+    with figures.style():
         rows = math.ceil(len(panels) / COLUMNS)
-        figure = sheet(2.4 * COLUMNS, 2.5 * rows + 0.3)
+        figure = figures.sheet(2.4 * COLUMNS, 2.5 * rows + 0.3)
         grid = figure.subplots(rows, COLUMNS, squeeze=False)
         for axes, (title, lines) in zip(grid.flat, panels, strict=False):
             for i, (name, path) in enumerate(lines.items()):
-                colour, dash = ("black", "-") if i == 0 else line(i - 1)
+                colour, dash = ("black", "-") if i == 0 else figures.line(i - 1)
                 ends = "o" if i == 0 else "s"
                 axes.plot(-path[:, 1], path[:, 0], dash, color=colour, label=name)
                 axes.plot(-path[-1, 1], path[-1, 0], ends, color=colour, markersize=3.5)
@@ -191,12 +190,12 @@ def coefficients(
     traces: by direction, means `[T, G]`, NaN where there are none; groups: names of the G.
     seconds: `[T]` since the crossing.
     """
-    with style():
-        figure = sheet(3.6 * len(traces), 2.9)
+    with figures.style():
+        figure = figures.sheet(3.6 * len(traces), 2.9)
         panels = figure.subplots(1, len(traces), sharey=True, squeeze=False)[0]
         for axes, (title, trace) in zip(panels, traces.items(), strict=True):
             for i, name in enumerate(groups):
-                colour, dash = line(i)
+                colour, dash = figures.line(i)
                 axes.plot(seconds, trace[:, i], dash, color=colour, label=name)
             axes.axvline(0.0, color="0.6", linewidth=0.8)
             axes.set(title=title, xlabel="time since the crossing [s]")

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vertiwm_jax import machine, runs
+from vertiwm_jax import figures, machine, runs
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.controllers import REFERENCE
@@ -53,7 +53,7 @@ def after_training(trained: Trained) -> str:
     columns = runs.read_columns(folder)
     labels = {name: label for name, label in CURVES.items() if name in columns}
     figure = plots.learning_curves({config.name: columns}, "transitions", labels, "transitions")
-    plots.save(figure, folder / "learning_curves.png")
+    figures.save(figure, folder / "learning_curves.png")
     machine.forget_programs()  # Tests need the memory.
     test = experiment.test_environment(config, trained.held_out)
     policies = experiment.learned(config, folder) | config.baselines
@@ -122,7 +122,7 @@ def write(
             goal_radius,
             STEP_SECONDS,
         )
-        plots.save(figure, folder / f"trajectories_{name.replace(', ', '_')}.png")
+        figures.save(figure, folder / f"trajectories_{name.replace(', ', '_')}.png")
 
 
 def markdown(groups: Mapping[str, Results], reference: str) -> str:

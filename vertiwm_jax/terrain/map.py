@@ -86,9 +86,9 @@ class TerrainMap:
 
         names: of all worlds; their numbers by default.
         """
-        from vertiwm_jax.evaluation import plots
+        from vertiwm_jax.terrain import picture
 
-        return plots.worlds(self, names)
+        return picture.plot(self, names)
 
     @property
     def extent(self) -> tuple[jax.Array, jax.Array]:

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vertiwm_jax import runs
+from vertiwm_jax import figures, runs
 from vertiwm_jax.config import ConfigError
-from vertiwm_jax.env import render
-from vertiwm_jax.evaluation import plots
 from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain import picture
 from vertiwm_jax.viewing.scene import FUSION, TILT, Scene, panels
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ COLOURS = 56
 """Of all frames of a GIF, besides those of lines."""
 _LABELS = {TILT: "angle [deg]", FUSION: "0 Transformer,\n1 NeSAM"}
 """Of the panels that are drawn."""
-_DRIVEN, _PREDICTED = (plots.line(i)[0] for i in (0, 1))
+_DRIVEN, _PREDICTED = (figures.line(i)[0] for i in (0, 1))
 _RECTANGLE = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) / 2
 
 Show = Callable[[int], None]
@@ -48,7 +47,7 @@ def write(scene: Scene, path: Path) -> None:
     from matplotlib.animation import FuncAnimation
 
     writer = WRITERS[path.suffix](path)
-    with plots.style(), runs.new_content(path) as unfinished:
+    with figures.style(), runs.new_content(path) as unfinished:
         figure, show = draw(scene)
 
         def frame(step: int) -> list:
@@ -62,7 +61,7 @@ def write(scene: Scene, path: Path) -> None:
 def draw(scene: Scene) -> tuple[Figure, Show]:
     """The figure, and a function that moves everything in it to its place at a step."""
     strips = {name: lines for name, lines in panels(scene).items() if name in _LABELS}
-    figure = plots.sheet(6.4, 4.2 + 1.15 * len(strips))
+    figure = figures.sheet(6.4, 4.2 + 1.15 * len(strips))
     overhead, *below = figure.subplots(1 + len(strips), 1, height_ratios=[4, *(1 for _ in strips)])
     moving = [_draw_map(overhead, scene)]
     for axes, (title, lines) in zip(below, strips.items(), strict=True):
@@ -86,8 +85,8 @@ def _draw_map(axes: Axes, scene: Scene) -> Show:
     from matplotlib.patches import Circle, Polygon
 
     terrain, vehicle, prediction = scene.terrain, scene.vehicle, scene.prediction
-    extent = render.extent(terrain)
-    axes.imshow(render.shaded(terrain, scene.world), extent=extent, interpolation="nearest")
+    extent = picture.extent(terrain)
+    axes.imshow(picture.shaded(terrain, scene.world), extent=extent, interpolation="nearest")
     axes.grid(False)
     axes.set(xlabel="x [m], east", ylabel="y [m], north")
     if scene.goal is not None:
@@ -143,7 +142,7 @@ def _middles(scene: Scene) -> np.ndarray:
 
     It stays where it is until the vehicle comes near its edge: a GIF then holds only what moves.
     """
-    west, east, south, north = render.extent(scene.terrain)
+    west, east, south, north = picture.extent(scene.terrain)
     low, high = np.array([west, south]) + REACH, np.array([east, north]) - REACH
     middles = [np.clip(scene.state[0, :2], low, high)]
     for place in scene.state[1:, :2]:
@@ -154,7 +153,7 @@ def _middles(scene: Scene) -> np.ndarray:
 
 def _draw_strip(axes: Axes, scene: Scene, label: str, lines: dict[str, np.ndarray]) -> Show:
     for i, (name, values) in enumerate(lines.items()):
-        colour, dash = plots.line(i)
+        colour, dash = figures.line(i)
         axes.plot(scene.seconds, values, dash, color=colour, label=name)
     axes.set_ylabel(label)
     _legend_above(axes)
@@ -188,7 +187,7 @@ def _gif(path: Path) -> AbstractMovieWriter:
             some = self._frames[:: max(1, len(self._frames) // 8)]
             sheet = Image.fromarray(np.concatenate([np.asarray(frame) for frame in some]))
             palette, plain = sheet.quantize(COLOURS), Image.Dither.NONE
-            lines = b"".join(bytes.fromhex(plots.line(i)[0][1:]) for i in range(7)) + b"\xff" * 3
+            lines = b"".join(bytes.fromhex(figures.line(i)[0][1:]) for i in range(7)) + b"\xff" * 3
             palette.putpalette((palette.getpalette() or [])[: 3 * COLOURS] + list(lines))
             self._frames = [frame.quantize(palette=palette, dither=plain) for frame in self._frames]
             super().finish()

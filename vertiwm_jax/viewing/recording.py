@@ -9,13 +9,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from vertiwm_jax import geometry, runs
-from vertiwm_jax.env import render
-from vertiwm_jax.evaluation import plots
-from vertiwm_jax.terrain import query
+from vertiwm_jax import figures, geometry, runs
+from vertiwm_jax.terrain import picture, query
 from vertiwm_jax.viewing.scene import WHEELS, Scene, panels
 
-DRIVEN, PREDICTED = (plots.line(i)[0] for i in (0, 1))
+DRIVEN, PREDICTED = (figures.line(i)[0] for i in (0, 1))
 _TYRE, _SPOKE, _CABIN, _OBSTACLE, _GOAL = "#202020", "#D0D0D0", "#A9C9DE", "#4A4A4A", "#000000"
 
 
@@ -58,14 +56,14 @@ def _ground(stream: rr.RecordingStream, scene: Scene) -> None:
     terrain = scene.terrain
     elevation = np.asarray(terrain.elevation[scene.world])
     rows, columns = elevation.shape
-    west, east, south, north = render.extent(terrain)
+    west, east, south, north = picture.extent(terrain)
     u, v = np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, rows))
     x, y = west + u * (east - west), north - v * (north - south)
     # The corners of each cell: north-west, north-east, south-west, south-east.
     number = np.arange(rows * columns).reshape(rows, columns)
     lower, upper = slice(1, None), slice(None, -1)
     nw, ne, sw, se = (number[i, j].ravel() for i in (upper, lower) for j in (upper, lower))
-    image = (255 * render.shaded(terrain, scene.world)).round().astype(np.uint8)
+    image = (255 * picture.shaded(terrain, scene.world)).round().astype(np.uint8)
     log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     log(
         "world/terrain",
@@ -169,7 +167,7 @@ def _plots(stream: rr.RecordingStream, scene: Scene) -> None:
     for title, lines in panels(scene).items():
         for i, (name, values) in enumerate(lines.items()):
             entity, known = _entity("plots", title, name), np.isfinite(values)
-            style = rr.SeriesLines(colors=_rgb(plots.line(i)[0]), names=name, widths=1.5)
+            style = rr.SeriesLines(colors=_rgb(figures.line(i)[0]), names=name, widths=1.5)
             stream.log(entity, style, static=True, strict=True)
             columns = rr.Scalars.columns(scalars=values[known])
             stream.send_columns(entity, _times(scene, known), columns, strict=True)
