@@ -160,8 +160,8 @@ def test_physics_is_differentiated_exactly_and_has_to_read_the_map():
     ("settings", "words"),
     [
         ({"horizon": 0}, "horizon: expected at least 1, found 0"),
-        ({"memory": 1.5}, "memory: expected above 0 and at most 1, found 1.5"),
-        ({"noise": (1, 1, 1, 1, 1, 0)}, "noise: expected above 0, found"),
+        ({"memory": 1.5}, "memory: expected more than 0 and at most 1, found 1.5"),
+        ({"noise": (1, 1, 1, 1, 1, 0)}, "noise: expected more than 0, found"),
     ],
 )
 def test_bad_settings_are_named(settings, words):
