@@ -102,11 +102,12 @@ class _Teller(logging.Handler):
 def told() -> Iterator[None]:
     """What the library logs is printed."""
     log, teller = logging.getLogger("vertiwm_jax"), _Teller()
-    level = log.level
+    before = log.level, log.propagate
     log.addHandler(teller)
     log.setLevel(logging.INFO)
+    log.propagate = False  # Packages that are imported later may print what reaches the root.
     try:
         yield
     finally:
         log.removeHandler(teller)
-        log.setLevel(level)
+        log.level, log.propagate = before
