@@ -102,7 +102,7 @@ class _Teller(logging.Handler):
 def told() -> Iterator[None]:
     """What the library logs is printed."""
     log, teller = logging.getLogger("vertiwm_jax"), _Teller()
-    before = log.level, log.propagate
+    level, propagate = log.level, log.propagate
     log.addHandler(teller)
     log.setLevel(logging.INFO)
     log.propagate = False  # Packages that are imported later may print what reaches the root.
@@ -110,4 +110,5 @@ def told() -> Iterator[None]:
         yield
     finally:
         log.removeHandler(teller)
-        log.level, log.propagate = before
+        log.setLevel(level)  # Assigning the attribute would leave what `logging` has cached.
+        log.propagate = propagate
