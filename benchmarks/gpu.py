@@ -36,8 +36,8 @@ from benchmarks import operations
 from benchmarks._harness import cell, hardware, measure
 from benchmarks._programs import Job, Program, compiled
 from benchmarks.models import drives, driving
+from vertiwm_jax import atomic, runs, training
 from vertiwm_jax import config as configuration
-from vertiwm_jax import runs, training
 from vertiwm_jax.env.navigation import NavigationConfig
 from vertiwm_jax.env.suites import GroundConfig
 from vertiwm_jax.models.registry import ModelName
@@ -302,7 +302,7 @@ def run(bench: Benchmark, parts: Sequence[str], seconds: float, found: Found) ->
 
     def write() -> None:
         found["seconds"] = time.monotonic() - start
-        runs.write_atomic(bench.output, json.dumps(found, indent=1) + "\n")
+        atomic.write(bench.output, json.dumps(found, indent=1) + "\n")
 
     for name in parts:
         make, percent = PARTS[name]

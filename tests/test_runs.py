@@ -1,8 +1,6 @@
-import contextlib
 import itertools
 import json
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -10,27 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from disks import full_disk
 from tensorboardX.proto.event_pb2 import Event
 
-from vertiwm_jax import config, runs, tracking
-from vertiwm_jax.runs import Progress, Run, RunError, new_folder, read_metrics, write_atomic
-from vertiwm_jax.tracking import TrackingError
+from vertiwm_jax import config, runs, trackers
+from vertiwm_jax.runs import Progress, Run, RunError, read_metrics
+from vertiwm_jax.trackers import TrackingError
 
 
 @dataclass(frozen=True)
 class Settings:
     seed: int = 1
-
-
-@contextlib.contextmanager
-def full_disk(after: int):
-    """Any file of more than `after` bytes fails as on a full disk, partial write included."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (after, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def scalars(folder: Path) -> list[tuple[int, str, float]]:
@@ -141,56 +129,6 @@ def test_a_full_disk_under_tensorboard_is_told(tmp_path):
     assert steps(run.folder) == list(range(len(steps(run.folder))))
 
 
-def test_write_atomic_replaces(tmp_path):
-    path = tmp_path / "table.txt"
-    write_atomic(path, "grün")
-    write_atomic(path, "blau")
-    assert path.read_text(encoding="utf-8") == "blau"
-    write_atomic(path, b"\x00\x01")
-    assert path.read_bytes() == b"\x00\x01"
-    assert os.listdir(tmp_path) == ["table.txt"]
-
-
-def test_a_new_folder_is_whole_or_not_there(tmp_path):
-    with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "made") as unfinished:
-        (unfinished / "first").touch()
-        raise KeyboardInterrupt
-    assert os.listdir(tmp_path) == []
-    with new_folder(tmp_path / "made") as unfinished:
-        (unfinished / "first").touch()
-    assert os.listdir(tmp_path) == ["made"] and os.listdir(tmp_path / "made") == ["first"]
-    with pytest.raises(RunError, match="expected no such folder"), new_folder(tmp_path / "made"):
-        raise AssertionError
-    with pytest.raises(RunError, match="first/made: cannot make"):
-        new_folder(tmp_path / "made" / "first" / "made").__enter__()
-
-
-def test_a_full_disk_leaves_the_old_file(tmp_path):
-    path = tmp_path / "plot.png"
-    write_atomic(path, b"old")
-    with full_disk(after=1000), pytest.raises(RunError, match=r"plot\.png: cannot write"):
-        write_atomic(path, b"x" * 5000)
-    assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["plot.png"]
-    with pytest.raises(RunError, match="No such file"):
-        write_atomic(tmp_path / "absent" / "plot.png", b"x")
-
-
-@pytest.mark.parametrize("moment", [(os, "fsync"), (Path, "replace")])
-def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch, moment):
-    path = tmp_path / "plot.png"
-    write_atomic(path, b"old")
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(*moment, interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        write_atomic(path, b"new")
-    assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["plot.png"]
-
-
 def test_an_interrupted_log_leaves_whole_lines(tmp_path, monkeypatch):
     run = Run.create(tmp_path, "ppo", Settings())
     run.log(1, {"return": 1.0})
@@ -277,7 +215,7 @@ def test_metrics_also_go_to_a_named_project_of_weights_and_biases(tmp_path, monk
 
 
 def test_a_project_without_the_package_is_said_before_a_folder_is_made(tmp_path, monkeypatch):
-    monkeypatch.setattr(tracking, "find_spec", lambda name: None)
+    monkeypatch.setattr(trackers, "find_spec", lambda name: None)
     message = "wandb: expected the package for project 'driving', found none; pip install wandb"
     with pytest.raises(TrackingError, match=message):
         Run.begin(Tracked(runs=tmp_path), "ppo", project="driving")

@@ -6,7 +6,7 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vertiwm_jax import runs
+from vertiwm_jax import atomic
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,11 +29,11 @@ _STYLE: dict[Any, Any] = {
 
 
 def save(figure: Figure, path: str | Path) -> None:
-    """Writes a figure in the format of its ending, as a whole or not at all; raises `RunError`."""
+    """Writes a figure in the format of its ending, whole or not at all; raises `WriteError`."""
     image = io.BytesIO()
     with style():
         figure.savefig(image, format=Path(path).suffix[1:])
-    runs.write_atomic(path, image.getvalue())
+    atomic.write(path, image.getvalue())
 
 
 def line(i: int) -> tuple[str, str]:

@@ -1,16 +1,12 @@
 """Run folders: configuration, metrics and progress of one command, safe against interruption."""
 
 import contextlib
-import csv
 import dataclasses
-import io
 import json
 import math
 import os
-import shutil
-import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -19,9 +15,9 @@ from typing import Any, ClassVar, Protocol, Self
 import rich.progress
 from rich.console import Console
 
-from vertiwm_jax import config, hosts, tracking
+from vertiwm_jax import atomic, config, hosts, trackers
 from vertiwm_jax.errors import UserError
-from vertiwm_jax.tensorboard import Events
+from vertiwm_jax.trackers import Events
 
 METRICS = "metrics.jsonl"
 
@@ -80,8 +76,8 @@ class Run:
         """
         folder = Path(folder)
         kept = [entry for entry in read_metrics(folder) if entry["step"] <= step]
-        write_atomic(folder / METRICS, "".join(json.dumps(entry) + "\n" for entry in kept))
-        write_atomic(folder / "config.yaml", config.dump(settings))
+        atomic.write(folder / METRICS, "".join(json.dumps(entry) + "\n" for entry in kept))
+        atomic.write(folder / "config.yaml", config.dump(settings))
         try:
             events = Events(folder)
             events.restart(step + 1)
@@ -100,7 +96,7 @@ class Run:
         """
         kept = dataclasses.replace(settings, resume=None)
         if project:
-            tracking.check(project)
+            trackers.check(project)
         if settings.resume is None:
             run = cls.create(hosts.own(settings.runs), name, kept)
         else:
@@ -126,7 +122,7 @@ class Run:
     def _track(self, project: str | None, settings: Any) -> None:
         self._project = project
         if project and hosts.is_first():
-            self._tracker = tracking.begin(project, self.folder, self.outermost, settings)
+            self._tracker = trackers.begin(project, self.folder, self.outermost, settings)
 
     @classmethod
     def _begin(cls, folder: Path, settings: Any) -> Self:
@@ -268,71 +264,6 @@ def read_columns(folder: str | Path) -> dict[str, list[float]]:
     lines = read_metrics(folder)
     names = dict.fromkeys(name for line in lines for name in line)
     return {name: [line.get(name, math.nan) for line in lines] for name in names}
-
-
-def csv_text(lines: Sequence[Mapping[str, Any]]) -> str:
-    """Rows with equal keys as CSV, with a header line."""
-    table = io.StringIO()
-    writer = csv.DictWriter(table, list(lines[0]))
-    writer.writeheader()
-    writer.writerows(lines)
-    return table.getvalue()
-
-
-def write_atomic(path: str | Path, data: bytes | str) -> None:
-    """Replace the file at `path` by `data` as a whole, or not at all.
-
-    Text is written as UTF-8. On any failure the old content stays and no partial file is left;
-    what the system refuses (a full disk, no permission) raises `RunError`.
-    """
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        try:
-            with partial.open("wb") as file:
-                file.write(data.encode() if isinstance(data, str) else data)
-                file.flush()
-                os.fsync(file.fileno())
-            partial.replace(path)
-        except BaseException:
-            partial.unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise RunError(f"{path}: cannot write, the file is as it was: {error}") from error
-
-
-@contextlib.contextmanager
-def new_content(path: str | Path) -> Iterator[Path]:
-    """A file to fill, which then replaces the one at `path`, like `write_atomic`.
-
-    For writers that need a file.
-    """
-    path = Path(path)
-    with tempfile.TemporaryDirectory() as folder:
-        unfinished = Path(folder) / path.name
-        yield unfinished
-        write_atomic(path, unfinished.read_bytes())
-
-
-@contextlib.contextmanager
-def new_folder(path: str | Path) -> Iterator[Path]:
-    """A folder to fill, which then becomes the new folder at `path` as a whole, or not at all.
-
-    A folder that exists already, or that cannot be made, raises `RunError`.
-    """
-    path = Path(path)
-    if path.exists():
-        raise RunError(f"{path}: expected no such folder yet, found one; remove it first")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        partial.mkdir(parents=True)
-    except OSError as error:
-        raise RunError(f"{path}: cannot make the folder: {error}") from error
-    try:
-        yield partial
-        partial.rename(path)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _append(path: Path, line: str) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from doors import door, refusal
 
-from vertiwm_jax import runs
+from vertiwm_jax import atomic
 from vertiwm_jax.cli import collect
 from vertiwm_jax.env.observation import LAYOUT, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
@@ -106,15 +106,15 @@ def test_what_cannot_be_written_leaves_nothing_half_written(maps, tmp_path, monk
         raise OSError(28, "No space left on device")
 
     run_folder = tmp_path / "drives"
-    write = runs.write_atomic
+    write = atomic.write
 
     def write_on_a_full_disk(path, data):
         with monkeypatch.context() as patch:
             if path.name == "world_000.npz":
-                patch.setattr(runs.os, "fsync", full)
+                patch.setattr(atomic.os, "fsync", full)
             write(path, data)
 
-    monkeypatch.setattr(runs, "write_atomic", write_on_a_full_disk)
+    monkeypatch.setattr(atomic, "write", write_on_a_full_disk)
     argv = ("--output", run_folder, "--worlds", maps, "--drives", 1, "--seconds", 0.1)
     assert "No space left" in refusal(door("collect"), *argv)
     assert sorted(path.name for path in run_folder.iterdir()) == ["config.yaml", "maps"]

@@ -13,8 +13,8 @@ from doors import door, refusal, untrained
 from env.worlds import SNOW, bicycle_env, hills, task
 from flax import struct
 
+from vertiwm_jax import atomic
 from vertiwm_jax import config as configuration
-from vertiwm_jax import runs
 from vertiwm_jax.cli import export
 from vertiwm_jax.deploy import onnx_graph, run_policy, stablehlo
 from vertiwm_jax.env import observation, route
@@ -95,7 +95,7 @@ def written(policy, folder):
     """The files of a policy, as on a robot, and the policy in NumPy."""
     made = export.files(policy, None, CONFIG, hmmwv(), 8, onnx_graph.record)
     for name, data in made.items():
-        runs.write_atomic(folder / name, data)
+        atomic.write(folder / name, data)
     return made, run_policy.load(folder)
 
 

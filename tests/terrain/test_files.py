@@ -4,8 +4,10 @@ import sys
 import jax
 import numpy as np
 import pytest
+from disks import full_disk
 from PIL import Image
 
+from vertiwm_jax.atomic import WriteError
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
@@ -99,16 +101,10 @@ def test_save_keeps_the_selected_world_and_classes_of_ones_own(tmp_path):
     assert_same(files.load_map(tmp_path / "moon.npz"), worlds[1])
 
 
-def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
+def test_a_failed_save_leaves_the_old_file(tmp_path):
     terrain = files.load_map(write_drive_map(tmp_path / "a.npz"))
     before = (tmp_path / "a.npz").read_bytes()
-
-    def full(stream, **arrays):
-        stream.write(b"half")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(np, "savez_compressed", full)
-    with pytest.raises(OSError, match="No space left"):
+    with full_disk(after=100), pytest.raises(WriteError, match=r"a\.npz: cannot write"):
         files.save(terrain, tmp_path / "a.npz")
     assert (tmp_path / "a.npz").read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]

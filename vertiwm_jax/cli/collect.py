@@ -11,8 +11,8 @@ import jax
 import numpy as np
 import tyro
 
+from vertiwm_jax import atomic
 from vertiwm_jax import config as configuration
-from vertiwm_jax import runs
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import Bounds, ConfigError, Count, settings
 from vertiwm_jax.env.agent import Policy
@@ -191,7 +191,7 @@ def _claim(command: Collect) -> None:
         if command.output.is_dir() and any(command.output.iterdir()):
             raise ConfigError(f"{file}: expected a new folder, or one of this command")
         (command.output / "maps").mkdir(parents=True, exist_ok=True)
-        runs.write_atomic(file, configuration.dump(settings))
+        atomic.write(file, configuration.dump(settings))
     before = configuration.load(Collect, file)
     for name in (field.name for field in fields(Collect)):
         was, asked = getattr(before, name), getattr(settings, name)

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from vertiwm_jax import atomic
 from vertiwm_jax import config as configuration
-from vertiwm_jax import runs
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import AtLeastOne, ConfigError, Count
 from vertiwm_jax.env import suites
@@ -139,7 +139,7 @@ def _judge_all(
     costs = {str(row): TrainingCost.of(folder) for row, folder in folders.items()}
     table = policy_table.markdown(costs, judged)
     print(f"\n{table}")
-    runs.write_atomic(output / "table.md", table + "\n")
+    atomic.write(output / "table.md", table + "\n")
 
 
 def _learned(row: Row, settings: TrainConfig, folder: Path) -> Policies:

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 import jax
 import tyro
 
+from vertiwm_jax import atomic, figures
 from vertiwm_jax import config as configuration
-from vertiwm_jax import figures, runs
 from vertiwm_jax.adaptation.soil_filter import SoilFilter
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, settings
@@ -251,7 +251,7 @@ def _calibrate(command: Calibration) -> None:
     print("\n" + "\n\n".join(tables))
     if command.output:
         command.output.mkdir(parents=True, exist_ok=True)
-        runs.write_atomic(command.output / "calibration.md", "\n\n".join(tables) + "\n")
+        atomic.write(command.output / "calibration.md", "\n\n".join(tables) + "\n")
         figure = calibration.picture(bounds[best], errors, order, nothing)
         figures.save(figure, command.output / "calibration.png")
 

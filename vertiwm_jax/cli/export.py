@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import tyro
 
-from vertiwm_jax import runs
+from vertiwm_jax import atomic
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.deploy import description, run_policy, stablehlo
@@ -44,9 +44,9 @@ def run(name: str, words: Sequence[str]) -> None:
     config = policy.config
     seen_by = load_encoders(config.weights) if policy.task.embeddings else None
     told = policy.task, config.vehicle.vehicle, config.action_repeat
-    with runs.new_folder(folder) as unfinished:
+    with atomic.new_folder(folder) as unfinished:
         for file, data in files(policy.acting, seen_by, *told, record).items():
-            runs.write_atomic(unfinished / file, data)
+            atomic.write(unfinished / file, data)
     print(f"the policy is in {folder}")
 
 

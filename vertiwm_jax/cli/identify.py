@@ -6,8 +6,8 @@ from pathlib import Path
 
 import tyro
 
+from vertiwm_jax import atomic
 from vertiwm_jax import config as configuration
-from vertiwm_jax import runs
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.learning import identification
 from vertiwm_jax.mechanics.vehicle import HMMWV
@@ -34,6 +34,6 @@ def run(name: str, words: Sequence[str]) -> None:
     found = identification.identify(
         command.drives, command.vehicle, free=command.free, horizon=command.horizon
     )
-    runs.write_atomic(command.output, configuration.dump(found))
+    atomic.write(command.output, configuration.dump(found))
     print(f"the vehicle is in {command.output}; to train with it:")
     print(f"python -m vertiwm_jax.ppo --model builtin --vehicle {command.output}")

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from vertiwm_jax import atomic, froude
 from vertiwm_jax import config as configuration
-from vertiwm_jax import froude, runs
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.importers import noise
 from vertiwm_jax.importers.noise import NoiseConfig
@@ -60,13 +60,13 @@ def make_logs(command: MakeLogs) -> tuple[float, list[str]]:
     if not sources:
         raise DataError(f"{command.data}: expected .npz files of drives, found none")
     rows_written = 0
-    with runs.new_folder(command.output) as unfinished:
+    with atomic.new_folder(command.output) as unfinished:
         (unfinished / "maps").mkdir()
         for source in sources:
             arrays, meta = schema.read(source)
             rows = _rows(arrays, driven.scale, command.noise, rng)
             rows_written += len(rows)
-            runs.write_atomic(unfinished / f"{source.stem}.csv", _text(rows))
+            atomic.write(unfinished / f"{source.stem}.csv", _text(rows))
             terrain = files.load_map(schema.find_map(source, meta["map"]))
             small = froude.scaled(terrain, 1 / driven.scale)
             files.save(small, unfinished / "maps" / source.name)

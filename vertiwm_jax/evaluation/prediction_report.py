@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
-from vertiwm_jax import figures, runs
+from vertiwm_jax import atomic, figures
 from vertiwm_jax.evaluation import error_sources, prediction, wheels
 from vertiwm_jax.evaluation.prediction import (
     BATCH,
@@ -19,6 +19,7 @@ from vertiwm_jax.evaluation.prediction import (
     PredictionErrors,
     TestWindows,
 )
+from vertiwm_jax.evaluation.tables import csv_text
 from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import query
@@ -57,9 +58,9 @@ def write(
         horizon = states.position.shape[1]
         tables.append(f"Wheels of {name} after {horizon} steps, beside those recorded\n")
         tables.append(wheels.format_table(turning))
-    runs.write_atomic(folder / "prediction.md", "\n\n".join(tables) + "\n")
+    atomic.write(folder / "prediction.md", "\n\n".join(tables) + "\n")
     lines = [line for models in rows for line in prediction.csv_lines(models)]
-    runs.write_atomic(folder / "prediction.csv", runs.csv_text(lines))
+    atomic.write(folder / "prediction.csv", csv_text(lines))
 
     growth = {row.name: row.growth for row in rows[-1]}
     figures.save(error_growth(growth, STEP_SECONDS), folder / "prediction.png")

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vertiwm_jax import figures, machine, runs
+from vertiwm_jax import atomic, figures, machine, runs
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.controllers import REFERENCE
@@ -22,6 +22,7 @@ from vertiwm_jax.env.task import TaskParams
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.evaluation.navigation import Summary, format_table
+from vertiwm_jax.evaluation.tables import csv_text
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import Trained
 from vertiwm_jax.state import STEP_SECONDS
@@ -107,10 +108,10 @@ def write(
 ) -> None:
     """`summary.md`, `summary.json`, `episodes.csv`, and a picture of a hard task of each suite."""
     folder.mkdir(parents=True, exist_ok=True)
-    runs.write_atomic(folder / "summary.md", markdown(groups, reference) + "\n")
+    atomic.write(folder / "summary.md", markdown(groups, reference) + "\n")
     numbers = json.dumps(summary(groups, reference), indent=2)
-    runs.write_atomic(folder / "summary.json", numbers + "\n")
-    runs.write_atomic(folder / "episodes.csv", runs.csv_text(_episodes(groups)))
+    atomic.write(folder / "summary.json", numbers + "\n")
+    atomic.write(folder / "episodes.csv", csv_text(_episodes(groups)))
     for name, results in groups.items():
         hard = _hard_task(results, reference)
         first = next(iter(results.values()))

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
+from vertiwm_jax import atomic, froude
 from vertiwm_jax import config as configuration
-from vertiwm_jax import froude, runs
 from vertiwm_jax.evaluation.tables import markdown
 from vertiwm_jax.importers import collection, grid_map, resampling, rosbag, table, tartandrive
 from vertiwm_jax.importers.log import Log
@@ -79,7 +79,7 @@ def import_drives(
     """
     settings = configuration.load(ImportSettings, settings_file)
     readers = [_reader(source, format) for source in sources]
-    with runs.new_folder(output) as unfinished:
+    with atomic.new_folder(output) as unfinished:
         terrain, said = _terrain(sources, settings_file, settings, map)
         imported = []
         with Progress(len(sources), "logs") as progress:

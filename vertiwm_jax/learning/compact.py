@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from vertiwm_jax import runs
+from vertiwm_jax import atomic
 from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.terrain import files
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     try:
         sizes = write(command.source, command.destination)
-    except (ValueError, OSError, runs.RunError) as error:  # drives, maps or destination
+    except (ValueError, OSError, atomic.WriteError) as error:  # drives, maps or destination
         sys.exit(f"error: {error}")
     for name, size in sizes.items():
         print(f"{name:<12} {size / 1e6:6.2f} MB")
@@ -66,7 +66,7 @@ def write(source: Path, destination: Path) -> dict[str, int]:
     """Compacts every collection in `source`, and gives the bytes written by folder.
 
     The same drives give the same bytes. Raises `DataError` or `MapError` on anything malformed,
-    `RunError` on what cannot be written.
+    `WriteError` on what cannot be written.
     """
     paths = [path for path in sorted(source.glob("*/*.npz")) if path.parent.name != "maps"]
     if not paths:
@@ -81,7 +81,7 @@ def write(source: Path, destination: Path) -> dict[str, int]:
             maps[ground] = files.load_map(ground)
         if "wheel_class" in arrays:
             schema.check_classes(path, arrays["wheel_class"], len(maps[ground].class_names))
-        runs.write_atomic(_target(path, source, destination), _archive(arrays, meta))
+        atomic.write(_target(path, source, destination), _archive(arrays, meta))
     for ground, terrain in maps.items():
         heights = jnp.asarray(_round(np.asarray(terrain.elevation), ELEVATION_STEP))
         files.save(replace(terrain, elevation=heights), _target(ground, source, destination))

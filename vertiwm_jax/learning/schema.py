@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vertiwm_jax import runs
+from vertiwm_jax import atomic
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.state import STEP_SECONDS
 
@@ -121,7 +121,7 @@ def write(
     text = json.dumps({**meta, "dt": STEP_SECONDS, "vehicle": vehicle})
     stream = io.BytesIO()
     np.savez_compressed(stream, allow_pickle=False, meta=np.array(text), **arrays)
-    runs.write_atomic(path, stream.getvalue())
+    atomic.write(path, stream.getvalue())
 
 
 def check(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

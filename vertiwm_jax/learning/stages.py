@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vertiwm_jax import checkpoints, runs
+from vertiwm_jax import atomic, checkpoints
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning import fitting
 from vertiwm_jax.learning.fitting import FitConfig, Problem
@@ -90,7 +90,7 @@ def fit(
     _log.info("\n%s", name)
     checkpoint = checkpoints.latest(folder / "checkpoints")
     with run.part(name, int(checkpoint.name) if checkpoint else 0, inputs.config) as part:
-        runs.write_atomic(folder / INPUTS, str(inputs))
+        atomic.write(folder / INPUTS, str(inputs))
         return fitting.fit(inputs.problem, inputs.config, params, data(), key, part)
 
 

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vertiwm_jax import atomic
 from vertiwm_jax import config as configuration
-from vertiwm_jax import runs
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError, Count, Share
 from vertiwm_jax.env import observation
@@ -118,7 +118,7 @@ class Policy:
 def save(folder: Path, config: PolicyConfig, policy: MeanAction, value: Value | TwinValue) -> None:
     """Writes the folder of a policy; leaves have a leading axis of seeds.
 
-    `RunError` where that is not possible.
+    `WriteError` where that is not possible.
     """
     folder.mkdir(exist_ok=True)
     arrays = {
@@ -131,8 +131,8 @@ def save(folder: Path, config: PolicyConfig, policy: MeanAction, value: Value | 
     }
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **jax.device_get(arrays))
-    runs.write_atomic(folder / "policy.yaml", configuration.dump(config))
-    runs.write_atomic(folder / "weights.npz", stream.getvalue())
+    atomic.write(folder / "policy.yaml", configuration.dump(config))
+    atomic.write(folder / "weights.npz", stream.getvalue())
 
 
 def load_policy(folder: str | Path, seed: int = 0) -> Policy:

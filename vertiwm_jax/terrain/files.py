@@ -1,8 +1,8 @@
 """Maps on disk: the `.npz` layout of the Chrono drives, and a user's own height map."""
 
+import io
 import json
 import math
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from vertiwm_jax import froude
+from vertiwm_jax import atomic, froude
 from vertiwm_jax.errors import one_line
 from vertiwm_jax.terrain import query, soil, vertibench
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
@@ -65,8 +65,10 @@ def load_map(path: str | Path, *, scale: float = 1.0, obstacles: bool = True) ->
 
 
 def save(terrain: TerrainMap, path: str | Path) -> None:
-    """Writes the selected world in the layout that `load_map` reads; whole or not at all."""
-    path = Path(path)
+    """Writes the selected world in the layout that `load_map` reads; whole or not at all.
+
+    Raises `WriteError` where that is not possible.
+    """
     world = int(terrain.world)
     elevation, semantic, friction, obstacles = (
         np.asarray(x[world])
@@ -88,24 +90,20 @@ def save(terrain: TerrainMap, path: str | Path) -> None:
         "soil_fields": list(_SOIL_FIELDS),
         "soils": soils,
     }
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as stream:
-            np.savez_compressed(
-                stream,
-                elevation=elevation,
-                semantic=semantic[np.ix_(rows, columns)],
-                resolution=np.asarray(terrain.resolution),
-                origin=np.asarray(terrain.origin),
-                class_rgb=np.asarray(terrain.class_rgb),
-                patch_class=semantic,
-                patch_friction=np.where(deformable[semantic], np.nan, friction).astype(np.float32),
-                obstacles=obstacles[(obstacles != 0).any(axis=1)],
-                meta=np.array(json.dumps(meta)),
-            )
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    stream = io.BytesIO()
+    np.savez_compressed(
+        stream,
+        elevation=elevation,
+        semantic=semantic[np.ix_(rows, columns)],
+        resolution=np.asarray(terrain.resolution),
+        origin=np.asarray(terrain.origin),
+        class_rgb=np.asarray(terrain.class_rgb),
+        patch_class=semantic,
+        patch_friction=np.where(deformable[semantic], np.nan, friction).astype(np.float32),
+        obstacles=obstacles[(obstacles != 0).any(axis=1)],
+        meta=np.array(json.dumps(meta)),
+    )
+    atomic.write(path, stream.getvalue())
 
 
 def from_heightmap(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vertiwm_jax import figures, runs
+from vertiwm_jax import atomic, figures
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import picture
@@ -43,11 +43,11 @@ def check(path: Path) -> None:
 
 
 def write(scene: Scene, path: Path) -> None:
-    """Writes the movie as a whole, or not at all; raises like `check`, and `RunError`."""
+    """Writes the movie as a whole, or not at all; raises like `check`, and `WriteError`."""
     from matplotlib.animation import FuncAnimation
 
     writer = WRITERS[path.suffix](path)
-    with figures.style(), runs.new_content(path) as unfinished:
+    with figures.style(), atomic.new_content(path) as unfinished:
         figure, show = draw(scene)
 
         def frame(step: int) -> list:

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from vertiwm_jax import figures, geometry, runs
+from vertiwm_jax import atomic, figures, geometry
 from vertiwm_jax.terrain import picture, query
 from vertiwm_jax.viewing.scene import WHEELS, Scene, panels
 
@@ -18,8 +18,8 @@ _TYRE, _SPOKE, _CABIN, _OBSTACLE, _GOAL = "#202020", "#D0D0D0", "#A9C9DE", "#4A4
 
 
 def write(scene: Scene, path: Path) -> None:
-    """Writes the recording as a whole, or not at all; raises `RunError`."""
-    with runs.new_content(path) as unfinished, rr.RecordingStream("vertiwm_jax") as stream:
+    """Writes the recording as a whole, or not at all; raises `WriteError`."""
+    with atomic.new_content(path) as unfinished, rr.RecordingStream("vertiwm_jax") as stream:
         stream.set_log_time_enabled(False)
         stream.save(unfinished, _layout(scene))
         _ground(stream, scene)

@@ -1,10 +1,18 @@
-"""Writes metrics as TensorBoard events."""
+"""Sends the metrics of a run to TensorBoard, and to Weights & Biases if a project is named."""
 
+import dataclasses
+import json
 import sys
 import time
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
+
+from vertiwm_jax.errors import UserError
+
+if TYPE_CHECKING:
+    from wandb import Run as Tracker
 
 # tensorboardX imports PyTorch wherever it is installed, for tensors that we do not have: this would
 # take two seconds of every start and half a gigabyte. Where it is there already, it stays.
@@ -44,3 +52,44 @@ class Events:
 
     def close(self) -> None:
         self._writer.close()
+
+
+class TrackingError(UserError):
+    """A run that cannot be tracked; the message says what is missing."""
+
+
+def check(project: str) -> None:
+    """`TrackingError` where the package is missing."""
+    if find_spec("wandb") is None:
+        raise TrackingError(
+            f"wandb: expected the package for project {project!r}, found none; pip install wandb"
+        )
+
+
+def begin(project: str, folder: Path, outermost: Path, settings: Any) -> "Tracker":
+    """A run of that project, continued if it exists; its files lie in `folder`.
+
+    outermost: folder of the run that this is a part of, or its own; its name names the group.
+    settings: a dataclass. `TrackingError` where Weights & Biases refuses.
+    """
+    import wandb
+
+    names = dict.fromkeys((outermost.name, folder.name))
+    try:
+        return wandb.init(
+            project=project,
+            dir=folder,
+            id="-".join(names),
+            name=folder.name,
+            group=outermost.name,
+            config=json.loads(json.dumps(dataclasses.asdict(settings), default=str)),
+            resume="allow",
+            reinit="create_new",
+            settings=wandb.Settings(console="off", silent=True),
+        )
+    except wandb.Error as error:
+        reason = str(error).splitlines()[0]
+        mend = "WANDB_MODE=offline needs neither an account nor a network"
+        raise TrackingError(
+            f"wandb: cannot begin a run of {project!r}: {reason}; {mend}"
+        ) from error
