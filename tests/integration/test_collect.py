@@ -24,7 +24,7 @@ from vertiwm_jax.simulators.driving import Drive
 from vertiwm_jax.simulators.protocol import Observation, SimulatorError
 from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain.reveal import RevealConfig
+from vertiwm_jax.terrain.sensing import SensingConfig
 
 GRASS, SAND = 3, 8
 STEPS = 6
@@ -279,10 +279,10 @@ def test_a_policy_sees_as_far_as_it_did_in_training():
     state = np.array([0, 0, 0.5, *np.zeros(9)], np.float32)
     acted = {}
     for sight in (12.0, np.inf):
-        config = NavigationConfig(reveal=RevealConfig(range=sight))
+        config = NavigationConfig(sensing=SensingConfig(range=sight))
         pilot = collection.to_goals(policy, config, None, hmmwv(), terrain, state[[0, 1, 5]], Ahead)
         pilot(state)
-        assert (pilot.state.belief is None) == np.isinf(sight)
+        assert (pilot.state.observed is None) == np.isinf(sight)
         acted[sight] = np.asarray(pilot._action)
     assert acted[np.inf][0] - acted[12.0][0] > 0.05
     # Of two who look at the same hills one knows that the way up costs more than its length.

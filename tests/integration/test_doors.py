@@ -30,7 +30,7 @@ from vertiwm_jax.rl.planning import PlanningConfig
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain.reveal import RevealConfig
+from vertiwm_jax.terrain.sensing import SensingConfig
 
 GRASS = 3
 TINY = """
@@ -240,15 +240,15 @@ def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch
 
 
 def test_how_far_sensors_see_can_be_asked_for(tmp_path):
-    config = PPOTraining(navigation=NavigationConfig(reveal=RevealConfig(cells=40)))
+    config = PPOTraining(navigation=NavigationConfig(sensing=SensingConfig(cells=40)))
     for asked, found in ((None, np.inf), (5.0, 5.0)):
-        command = evaluate.Navigation("random", reveal_range=asked)
+        command = evaluate.Navigation("random", sensing_range=asked)
         adapted = evaluate._adapted(config, command).navigation
-        assert adapted == NavigationConfig(reveal=RevealConfig(range=found, cells=40))
+        assert adapted == NavigationConfig(sensing=SensingConfig(range=found, cells=40))
     sighted = replace(config, navigation=NavigationConfig(embeddings=True))
     configuration.save(sighted, tmp_path / "config.yaml")
-    navigate = ("navigation", "--policy", tmp_path, "--reveal-range", "5")
-    assert "reveal.range: expected inf with embeddings" in refusal(door("evaluate"), *navigate)
+    navigate = ("navigation", "--policy", tmp_path, "--sensing-range", "5")
+    assert "sensing.range: expected inf with embeddings" in refusal(door("evaluate"), *navigate)
 
 
 class Driven(Exception):
@@ -267,11 +267,11 @@ def nothing_driven(monkeypatch):
 
 @pytest.mark.usefixtures("nothing_driven")
 def test_a_policy_of_a_known_map_drives_on_one_that_is_revealed(run):
-    navigate = ["navigation", "--policy", str(run), "--suites", "easy", "--reveal-range", "12"]
+    navigate = ["navigation", "--policy", str(run), "--suites", "easy", "--sensing-range", "12"]
     with pytest.raises(Driven) as found:
         door("evaluate")(navigate)
     env, params, policies, *_ = found.value.args
-    assert env.config.reveal.range == 12.0 and params.starts.belief is not None
+    assert env.config.sensing.range == 12.0 and params.starts.observed is not None
     assert any(name.startswith("ppo") for name in policies)
 
 

@@ -32,7 +32,7 @@ from vertiwm_jax.rl.learned import Corrected, MeanAction
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain.reveal import RevealConfig
+from vertiwm_jax.terrain.sensing import SensingConfig
 
 CONFIG = NavigationConfig(speed_range=(-1.0, 5.0))
 ACTORS = {
@@ -185,7 +185,7 @@ def test_the_observation_of_map_arrays(size, sighted):
         for data in (
             stablehlo.observe(config, hmmwv(), encoders),
             stablehlo.route(config, hmmwv()),
-            stablehlo.route(NavigationConfig(reveal=RevealConfig(range=12.0)), hmmwv()),
+            stablehlo.route(NavigationConfig(sensing=SensingConfig(range=12.0)), hmmwv()),
         )
     )
     arrays = (*(x[0] for x in arrays), terrain.origin, terrain.resolution)

@@ -14,8 +14,8 @@ from vertiwm_jax.perception.features import Encoders, init_pair, init_reduce, in
 from vertiwm_jax.perception.perceive import _plain, perceive, reduced
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain import patches, reveal
-from vertiwm_jax.terrain.reveal import RevealConfig
+from vertiwm_jax.terrain import patches, sensing
+from vertiwm_jax.terrain.sensing import SensingConfig
 
 CHANNELS = 5
 COARSE, AS_COARSE_AS_CLASSES, FINE, FINE_CLASSES = (1.3, 4), (1.0, 1), (0.98, 4), (1.0, 2 / 3)
@@ -131,12 +131,12 @@ def test_cells_of_one_color_and_cells_with_borders(classes):
 
 
 def test_a_map_of_which_a_part_is_known():
-    config, terrain, states = RevealConfig(range=4.0), world(), places(3)
+    config, terrain, states = SensingConfig(range=4.0), world(), places(3)
 
     def of_all(look):
         def seen(state):
             pose = state.position, state.rpy[2]
-            known = replace(terrain, belief=reveal.begin(config, terrain, *pose))
+            known = replace(terrain, observed=sensing.init(config, terrain, *pose))
             return look(PAIRS["shared"], known, state)
 
         return jax.jit(jax.vmap(seen))(states)

@@ -16,7 +16,7 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
-from vertiwm_jax.terrain.reveal import RevealConfig
+from vertiwm_jax.terrain.sensing import SensingConfig
 
 CONFIG = NavigationConfig(horizon_seconds=15.0)
 KEY = jax.random.key(0)
@@ -64,7 +64,7 @@ def test_it_drives_around_what_driving_straight_runs_into(blocked):
 
 def test_it_plans_in_what_it_has_seen_of_the_map():
     """What stands out of range changes no plan, and what comes into range is driven around."""
-    seeing = replace(CONFIG, reveal=RevealConfig(range=12.0))
+    seeing = replace(CONFIG, sensing=SensingConfig(range=12.0))
     intended = {}
     for config in (seeing, CONFIG):
         env, params = worlds.blocked(config)

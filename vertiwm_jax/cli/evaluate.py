@@ -156,8 +156,8 @@ class Navigation:
     """Tasks in a world; as many as after training by default."""
     seed: int | None = None
     """Draws other procedural worlds than those held out."""
-    reveal_range: float | None = None
-    """Metres at which sensors reveal the map, inf for all of it; by default as in training."""
+    sensing_range: float | None = None
+    """Range of sensors, m, inf to know all of the map; by default as in training."""
     output: Path | None = None
     """Folder for tables, all episodes and pictures."""
 
@@ -313,9 +313,9 @@ def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:
         config = replace(config, worlds=command.worlds)
     if command.vehicle is not None:
         config = replace(config, vehicle=command.vehicle)
-    if command.reveal_range is not None:
-        revealed = replace(config.navigation.reveal, range=command.reveal_range)
-        config = replace(config, navigation=replace(config.navigation, reveal=revealed))
+    if command.sensing_range is not None:
+        sensing = replace(config.navigation.sensing, range=command.sensing_range)
+        config = replace(config, navigation=replace(config.navigation, sensing=sensing))
     if command.planning is not None:
         planning = config.planning or PlanningConfig()
         config = replace(config, planning=planning if command.planning else None)

@@ -26,7 +26,7 @@ class Now:
     """One episode at the moment of a decision.
 
     task: what the environment is run with; of its terrain an agent may know what
-        `task.believed(state)` gives. observation: `[O]`.
+        `task.observed_map(state)` gives. observation: `[O]`.
     """
 
     task: TaskParams

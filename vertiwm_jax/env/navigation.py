@@ -23,7 +23,7 @@ from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
 from vertiwm_jax.networks.policy import Senses
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.state import STEP_SECONDS, VehicleState
-from vertiwm_jax.terrain import obstacles, query, reveal
+from vertiwm_jax.terrain import obstacles, query, sensing
 from vertiwm_jax.terrain.map import TerrainMap
 
 
@@ -157,10 +157,10 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
             ending=ending,
         )
         gain = jnp.where(running, gain, 0.0)
-        belief = state.belief
-        if belief is not None:
-            seen = reveal.look(config.reveal, terrain, belief, vehicle.position, yaw)
-            belief = jax.tree.map(partial(jnp.where, running), seen, belief)
+        observed = state.observed
+        if observed is not None:
+            seen = sensing.update(config.sensing, terrain, observed, vehicle.position, yaw)
+            observed = jax.tree.map(partial(jnp.where, running), seen, observed)
         new = dataclasses.replace(
             state,
             vehicle=vehicle,
@@ -170,7 +170,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
             stalled=stalled,
             ending=ending,
             variation=variation,
-            belief=belief,
+            observed=observed,
         )
         info = {
             "ending": ending,
@@ -190,7 +190,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         """`[O]` float32, see `observation.observe`, and the ground as encoders see it."""
         del key, action
         routes = params.routes.select(state.route)
-        terrain = params.believed(state)
+        terrain = params.observed_map(state)
         return see(self.config, terrain, params.vehicle, routes, state, params.encoders)
 
     def is_terminated(self, state: TaskState, params: TaskParams) -> jax.Array:

@@ -18,7 +18,7 @@ from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
-from vertiwm_jax.terrain import patches, query, reveal
+from vertiwm_jax.terrain import patches, query, sensing
 from vertiwm_jax.terrain.map import TerrainMap
 
 _Placed = tuple[VehicleState, History]
@@ -46,7 +46,7 @@ class ResetPool:
         """As `NavigationEnv.make_params`."""
         config = self.config
         self._check(vehicle, terrain, pool)
-        if config.reveal.partial:
+        if config.sensing.partial:
             routes = route.straight(config.route, terrain, pool.goal)
         else:
             routes = route.plan(config.route, terrain, vehicle, pool.world, pool.goal)
@@ -93,7 +93,7 @@ class ResetPool:
         """`ValueError` names what cannot be seen, or the first task that cannot be driven."""
         reach = float(np.hypot(vehicle.wheelbase, vehicle.track)) / 2
         patches.footprint_covered(reach, max(map(abs, self.config.speed_range)))
-        reveal.check(self.config.reveal, terrain)
+        sensing.check(self.config.sensing, terrain)
         tasks.validate(pool, terrain, self.config.goal_radius, self.config.map_margin)
 
     def _params(
@@ -177,10 +177,10 @@ def _settle(
             stalled=zero,
             ending=zero,
             variation=DomainRandomization.draw(starts.variation, jax.random.key(0), action),
-            belief=reveal.begin(config.reveal, selected, at_rest.position, at_rest.rpy[2]),
+            observed=sensing.init(config.sensing, selected, at_rest.position, at_rest.rpy[2]),
         )
-        believed = dataclasses.replace(selected, belief=state.belief)
-        return state, see(config, believed, vehicle, routes.select(number), state, encoders)
+        observed_map = dataclasses.replace(selected, observed=state.observed)
+        return state, see(config, observed_map, vehicle, routes.select(number), state, encoders)
 
     placed = parallel.vmap(settle, (None, None, None, 0))(dynamics, vehicle, terrain, pool)
     # Steps of all, and not all steps of each: inside of `vmap`, a scan is traced again until it is

@@ -19,9 +19,8 @@ from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.state import VehicleState
-from vertiwm_jax.terrain.belief import MapBelief
-from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.terrain.reveal import RevealConfig
+from vertiwm_jax.terrain.map import ObservedMap, TerrainMap
+from vertiwm_jax.terrain.sensing import SensingConfig
 
 
 @settings
@@ -39,10 +38,13 @@ class NavigationConfig:
     settle_steps: steps of standing still before a start is handed out.
     embeddings: whether an observation ends with the ground as a Transformer's encoders see it.
     route: how the way to the goal is found; it is straight where the map is not all known.
-    reveal: what sensors reveal of a map that is not known; by default all of it is.
+    sensing: what sensors see of a map that is unknown at first; by default all of it is known.
     """
 
-    GONE: ClassVar = {"chassis": "is gone; the sizes are those of the vehicle, see `vehicle`"}
+    GONE: ClassVar = {
+        "chassis": "is gone; the sizes are those of the vehicle, see `vehicle`",
+        "reveal": "is now sensing",
+    }
 
     goal_radius: float = 8.0
     horizon_seconds: float = 60.0
@@ -58,13 +60,13 @@ class NavigationConfig:
     embeddings: bool = False
     reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
     route: RouteConfig = RouteConfig()
-    reveal: RevealConfig = RevealConfig()
+    sensing: SensingConfig = SensingConfig()
 
     def check(self) -> None:
-        if self.reveal.partial and self.embeddings:
+        if self.sensing.partial and self.embeddings:
             raise ValueError(
-                "reveal.range: expected inf with embeddings, which show all of the map, "
-                f"found {self.reveal.range:g}"
+                "sensing.range: expected inf with embeddings, which show all of the map, "
+                f"found {self.sensing.range:g}"
             )
 
     @property
@@ -74,7 +76,7 @@ class NavigationConfig:
 
     def route_to(self, terrain: TerrainMap, vehicle: Vehicle, goal: jax.Array) -> Routes:
         """The vehicle's route to the goal `[2]`, m, in the selected world; can be compiled."""
-        if self.reveal.partial:
+        if self.sensing.partial:
             return route.straight(self.route, terrain, goal[None])
         return route.plan_one(self.route, terrain, vehicle, goal)
 
@@ -89,7 +91,7 @@ class TaskState(environment.EnvState):
     time: `[]` int32 steps done; stalled: `[]` int32 steps stalled without a break.
     ending: `[]` int32 `TerminationReason` code.
     variation: how this episode differs from what the map says.
-    belief: what the vehicle has seen of its world; None where it knows all of the map.
+    observed: what the vehicle has seen of its world; None where it knows all of the map.
     """
 
     vehicle: VehicleState
@@ -101,7 +103,7 @@ class TaskState(environment.EnvState):
     stalled: jax.Array
     ending: jax.Array
     variation: DomainRandomization
-    belief: MapBelief | None = None
+    observed: ObservedMap | None = None
 
 
 @struct.dataclass(kw_only=True)
@@ -133,12 +135,12 @@ class TaskParams(environment.EnvParams):
         routes, position = self.routes.select(state.route), state.vehicle.position
         return routes.cost_to_go(self.terrain, position[:2])
 
-    def believed(self, state: TaskState) -> TerrainMap:
-        """The world of an episode as far as its vehicle has seen it: what may drive it by."""
+    def observed_map(self, state: TaskState) -> TerrainMap:
+        """The world of an episode as far as its vehicle has seen it; agents may read this one."""
         terrain = self.terrain.select(state.world)
-        if state.belief is None:
+        if state.observed is None:
             return terrain
-        return dataclasses.replace(terrain, belief=state.belief)
+        return dataclasses.replace(terrain, observed=state.observed)
 
 
 def see(

@@ -23,8 +23,7 @@ from vertiwm_jax.networks.encoder import LATENT_CHANNELS
 from vertiwm_jax.perception.features import Encoders, TerrainFeatures, features
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import grid, patches
-from vertiwm_jax.terrain.belief import MapBelief
-from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.map import ObservedMap, TerrainMap
 from vertiwm_jax.terrain.patches import CELL_PIXELS, RELIEF_METRES
 
 Shared = tuple[tuple[Encoders, ...], TerrainMap]
@@ -45,17 +44,17 @@ _FOURS = patches.CELLS_OF_PATCH.reshape(2, _SIDE, 2, _SIDE, 2).swapaxes(2, 3).re
 class _Vehicles:
     """What each of V vehicles has of its own; leaves `[V, ...]`.
 
-    world: on which they are; belief: what they know of it, or None; position: m; yaw: rad.
+    world: on which they are; observed: what they know of it, or None; position: m; yaw: rad.
     """
 
     world: jax.Array
-    belief: MapBelief | None
+    observed: ObservedMap | None
     position: jax.Array
     yaw: jax.Array
 
     def on(self, terrain: TerrainMap) -> TerrainMap:
         """The map as one of them, leaves `[...]`, has it."""
-        return terrain.replace(world=self.world, belief=self.belief)  # type: ignore[attr-defined]
+        return terrain.replace(world=self.world, observed=self.observed)  # type: ignore[attr-defined]
 
 
 def look(
@@ -64,7 +63,7 @@ def look(
     """What `perceive` gives for one vehicle, to rounding."""
     seen = {field.name: None for field in fields(TerrainMap)}
     seen |= {name: getattr(terrain, name) for name in _SEEN}
-    vehicle = _Vehicles(terrain.world, terrain.belief, state.position, state.rpy[2])
+    vehicle = _Vehicles(terrain.world, terrain.observed, state.position, state.rpy[2])
     alone = jax.tree.map(lambda x: x[None], vehicle)
     found = _batched(latents)((encoders, TerrainMap(**seen)), alone)  # type: ignore[arg-type]
     return jax.tree.map(lambda x: x[0], found)
@@ -209,7 +208,7 @@ def _can_be_coarse(terrain: TerrainMap, vehicles: _Vehicles) -> bool:
     vertices, classes = terrain.elevation.shape[1:], terrain.semantic.shape[1:]
     if not all(isinstance(number, int) for number in vertices + classes):
         return False  # An export takes maps of any size.
-    return vehicles.belief is None and min(vertices) >= 3 and min(classes) >= 2
+    return vehicles.observed is None and min(vertices) >= 3 and min(classes) >= 2
 
 
 def _is_coarse(terrain: TerrainMap) -> jax.Array:

@@ -73,14 +73,14 @@ class Imagining(Agent):
 
     def init(self, now: Now) -> Plan:
         """The model's first history, and no correction."""
-        terrain = now.task.believed(now.state)
+        terrain = now.task.observed_map(now.state)
         history = self.env.dynamics.init(self.dynamics, terrain, now.state.vehicle)
         return Plan(history, jnp.zeros((self.planned, 2)))
 
     def act(self, now: Now, memory: Plan, key: jax.Array) -> tuple[jax.Array, Plan]:
         """The base, corrected as planned; the model's history follows the vehicle."""
         action = corrected(self.base, now.observation, key, memory.corrections[0])
-        terrain = now.task.believed(now.state)
+        terrain = now.task.observed_map(now.state)
         command = now.task.vehicle.command(action, self.env.config.speed_range)
         given = self.dynamics, terrain, memory.history, now.state.vehicle, command
         _, history = step(self.env.dynamics, *given)
@@ -96,10 +96,10 @@ class Imagining(Agent):
         return each(self.inside(now, memory), candidates, key)
 
     def inside(self, now: Now, memory: Plan) -> Now:
-        """The task as it is now, inside the model; what is believed of the map is true there."""
-        terrain = now.task.believed(now.state)
+        """The task as it is now, inside the model; the map as observed is the true one there."""
+        terrain = now.task.observed_map(now.state)
         task = replace(now.task, dynamics=self.dynamics, terrain=terrain)
-        state = replace(now.state, history=memory.history, belief=None)
+        state = replace(now.state, history=memory.history, observed=None)
         return replace(now, task=task, state=state)
 
     def hold(

@@ -3,14 +3,13 @@
 Every gather is a flat index into the stacked worlds, clipped first and then promised in bounds,
 so that a batch of vehicles on different worlds is one gather and copies no map. Outside the map
 the ground continues level from its edge; a NaN coordinate reads the first row or column. Where
-a map has a belief, unknown ground is that which the belief assumes.
+a map is observed in part, unknown ground is as `ObservedMap` assumes.
 """
 
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax.terrain.belief import MapBelief
-from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.map import ObservedMap, TerrainMap
 
 
 def on_map(terrain: TerrainMap, column: jax.Array, row: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -52,20 +51,22 @@ def _cell(
     return i, j
 
 
-def known(terrain: TerrainMap, belief: MapBelief, row: jax.Array, column: jax.Array) -> jax.Array:
-    """Whether the belief knows the map at fractional vertex coordinates on it."""
-    cell_rows, cell_columns = belief.known.shape
+def known(
+    terrain: TerrainMap, observed: ObservedMap, row: jax.Array, column: jax.Array
+) -> jax.Array:
+    """Whether a vehicle knows the map at fractional vertex coordinates on it."""
+    cell_rows, cell_columns = observed.known.shape
     i, j = _cell(terrain, cell_rows, cell_columns, row, column)
-    return gather(belief.known, i * cell_columns + j)
+    return gather(observed.known, i * cell_columns + j)
 
 
 def classes(terrain: TerrainMap, row: jax.Array, column: jax.Array, cell: jax.Array) -> jax.Array:
     """int32 class ids at fractional vertex coordinates on the map, which lie in the cells."""
     semantic = gather(terrain.semantic, cell).astype(jnp.int32)
-    belief = terrain.belief
-    if belief is None:
+    observed = terrain.observed
+    if observed is None:
         return semantic
-    return jnp.where(known(terrain, belief, row, column), semantic, belief.semantic)
+    return jnp.where(known(terrain, observed, row, column), semantic, observed.semantic)
 
 
 def _vertices(
@@ -73,13 +74,13 @@ def _vertices(
 ) -> jax.Array:
     """Heights of the vertices in the rows and columns, at the index, m."""
     heights = gather(terrain.elevation, index)
-    belief = terrain.belief
-    if belief is None:
+    observed = terrain.observed
+    if observed is None:
         return heights
     x = terrain.origin[0] + column * terrain.resolution
     y = terrain.origin[1] - row * terrain.resolution
-    guess = belief.plane[0] + belief.plane[1] * x + belief.plane[2] * y
-    return jnp.where(known(terrain, belief, row, column), heights, guess)
+    guess = observed.plane[0] + observed.plane[1] * x + observed.plane[2] * y
+    return jnp.where(known(terrain, observed, row, column), heights, guess)
 
 
 def bilinear(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Array:

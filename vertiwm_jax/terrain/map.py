@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.terrain import soil
-from vertiwm_jax.terrain.belief import MapBelief
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.soil import Soil
 
@@ -29,6 +28,21 @@ class MapError(UserError, ValueError):
     def __init__(self, name: str, field: str, expected: str, found: str, mend: str = "") -> None:
         ending = f"; {mend}" if mend else ""
         super().__init__(f"{name}: {field}: expected {expected}, found {found}{ending}")
+
+
+@struct.dataclass
+class ObservedMap:
+    """The cells of the selected world that a vehicle knows, and its assumption about the rest.
+
+    known: `[n, n]` bool, for cells that tile the map; row 0 is the northernmost.
+    plane: `[3]` of unknown ground: its height at x = y = 0, m, and its slopes along x and y.
+    semantic: `[]` int32 class id; friction: `[]` friction coefficient, both of unknown ground.
+    """
+
+    known: jax.Array
+    plane: jax.Array
+    semantic: jax.Array
+    friction: jax.Array
 
 
 @struct.dataclass
@@ -52,7 +66,7 @@ class TerrainMap:
     world: `[]` int32, the selected world.
     class_names: K names, static.
     grip: `[]` factor on all friction; None for 1.
-    belief: what a vehicle knows of the selected world, which queries then answer from; None for
+    observed: what a vehicle knows of the selected world, which queries then answer from; None for
         all.
     """
 
@@ -68,7 +82,7 @@ class TerrainMap:
     world: jax.Array
     class_names: tuple[str, ...] = struct.field(pytree_node=False)
     grip: jax.Array | None = None
-    belief: MapBelief | None = None
+    observed: ObservedMap | None = None
 
     @property
     def worlds(self) -> int:

@@ -36,7 +36,7 @@ def gap(
     """
     obstacles = terrain.obstacles[terrain.world]
     there = obstacles[:, 4] > 0
-    if terrain.belief is not None:
+    if terrain.observed is not None:
         there &= query.known(terrain, obstacles[:, :2])
     x, y = xy[..., 0], xy[..., 1]
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)

@@ -52,9 +52,9 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
     friction = grid.gather(terrain.friction, cell)
     if terrain.grip is not None:
         friction = terrain.grip * friction
-    if terrain.belief is not None:
-        known = grid.known(terrain, terrain.belief, row, column)
-        friction = jnp.where(known, friction, terrain.belief.friction)
+    if terrain.observed is not None:
+        known = grid.known(terrain, terrain.observed, row, column)
+        friction = jnp.where(known, friction, terrain.observed.friction)
     return Surface(height, gradient, semantic, friction)
 
 
@@ -76,10 +76,10 @@ def height(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
 
 def known(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     """Whether the map is known at points `[..., 2]` p_world, m: `[...]` bool."""
-    if terrain.belief is None:
+    if terrain.observed is None:
         return jnp.ones(xy.shape[:-1], bool)
     column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
-    return grid.known(terrain, terrain.belief, row, column)
+    return grid.known(terrain, terrain.observed, row, column)
 
 
 def _grid_coordinates(

@@ -9,15 +9,15 @@ from env.worlds import GRASS, SNOW, hills
 from scipy.interpolate import RegularGridInterpolator
 
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain import obstacles, patches, query, reveal
-from vertiwm_jax.terrain.reveal import RevealConfig
+from vertiwm_jax.terrain import obstacles, patches, query, sensing
+from vertiwm_jax.terrain.sensing import SensingConfig
 
-DISC = RevealConfig(range=12.0)
-SECTOR = RevealConfig(range=15.0, field_of_view=2.0, cells=40)
+DISC = SensingConfig(range=12.0)
+SECTOR = SensingConfig(range=15.0, field_of_view=2.0, cells=40)
 ROCKS = np.array([[9.0, 2.0, 4.0, 4.0, 2.0], [14.0, 0.0, 5.0, 5.0, 2.0]], np.float32)
 POSES = [(0.0, 0.0, 0.3), (4.0, -3.0, 2.5), (-50.0, 60.0, -1.0)]
-look = jax.jit(reveal.look, static_argnums=0)
-begin = jax.jit(reveal.begin, static_argnums=0)
+update = jax.jit(sensing.update, static_argnums=0)
+init = jax.jit(sensing.init, static_argnums=0)
 
 
 def world(elevation=None, origin=(-60.0, 62.0)):
@@ -31,10 +31,10 @@ def at(x, y, yaw):
 
 
 def along(config, terrain, poses):
-    belief = begin(config, terrain, *at(*poses[0]))
+    observed = init(config, terrain, *at(*poses[0]))
     for pose in poses[1:]:
-        belief = look(config, terrain, belief, *at(*pose))
-    return belief
+        observed = update(config, terrain, observed, *at(*pose))
+    return observed
 
 
 def seen_from(config, x, y, yaw, origin=(-60.0, 62.0), side=128.0):
@@ -46,7 +46,7 @@ def seen_from(config, x, y, yaw, origin=(-60.0, 62.0), side=128.0):
         off = np.arctan2(north, east) - yaw
         off = abs(np.arctan2(np.sin(off), np.cos(off)))
         distance = np.hypot(east, north)
-        inside = off <= config.field_of_view / 2 or distance <= reveal.NEAR
+        inside = off <= config.field_of_view / 2 or distance <= sensing.NEAR
         known[i, j] = distance <= config.range and inside
     return known
 
@@ -62,7 +62,7 @@ def interpolated(grid, heights, xy):
     return RegularGridInterpolator((-north, east), heights)(np.stack([-xy[:, 1], xy[:, 0]], -1))
 
 
-@pytest.mark.parametrize("config", [DISC, SECTOR, RevealConfig(range=3.0)])
+@pytest.mark.parametrize("config", [DISC, SECTOR, SensingConfig(range=3.0)])
 def test_cells_become_known_as_counted_one_by_one_and_stay_so(config):
     terrain, known = world(), np.zeros((config.cells, config.cells), bool)
     for number, pose in enumerate(POSES, start=1):
@@ -75,8 +75,8 @@ def test_cells_become_known_as_counted_one_by_one_and_stay_so(config):
 def test_unknown_ground_lies_in_the_plane_through_what_is_seen():
     """By scipy: heights between vertices, and least squares in world coordinates."""
     terrain, (x, y, yaw) = world(), POSES[1]
-    belief = begin(SECTOR, terrain, *at(x, y, yaw))
-    forward, left = np.stack(reveal._places(SECTOR)).astype(np.float64)
+    observed = init(SECTOR, terrain, *at(x, y, yaw))
+    forward, left = np.stack(sensing._places(SECTOR)).astype(np.float64)
     assert np.hypot(forward, left).max() < SECTOR.range
     xy = np.stack(
         [x + np.cos(yaw) * forward - np.sin(yaw) * left,
@@ -85,12 +85,12 @@ def test_unknown_ground_lies_in_the_plane_through_what_is_seen():
     # What is not seen is level with the ground below, until there is a plane.
     grid = 62.0 - np.arange(129.0), -60.0 + np.arange(129.0)
     below = interpolated(grid, hills(), np.array([[x, y]]))
-    believed = np.where(vertices(seen_from(SECTOR, x, y, yaw)), hills(), below)
-    heights = interpolated(grid, believed, xy)
+    assumed = np.where(vertices(seen_from(SECTOR, x, y, yaw)), hills(), below)
+    heights = interpolated(grid, assumed, xy)
     plane = np.linalg.lstsq(np.c_[np.ones(len(xy)), xy], heights, rcond=None)[0]
-    np.testing.assert_allclose(belief.plane, plane, atol=1e-4)
+    np.testing.assert_allclose(observed.plane, plane, atol=1e-4)
     far = np.array([[30.0, -40.0], [-20.0, 10.0]])
-    found = query.height(replace(terrain, belief=belief), jnp.asarray(far, jnp.float32))
+    found = query.height(replace(terrain, observed=observed), jnp.asarray(far, jnp.float32))
     np.testing.assert_allclose(found, plane[0] + far @ plane[1:], atol=1e-3)
 
 
@@ -99,22 +99,24 @@ def test_an_incline_goes_on_as_far_as_the_map(config):
     slope = 8 + 0.05 * (np.arange(129)[None, :] - 64) - 0.03 * (np.arange(129)[:, None] - 64)
     terrain = world(slope)
     # By the second look, what was guessed of the plane's rim is right.
-    belief = along(config, terrain, [POSES[0]] * 12)
+    observed = along(config, terrain, [POSES[0]] * 12)
     xy = jnp.asarray(np.random.default_rng(0).uniform(-59, 60, (200, 2)), jnp.float32)
     expected = query.height(terrain, xy)
-    np.testing.assert_allclose(query.height(replace(terrain, belief=belief), xy), expected, 0.02)
+    np.testing.assert_allclose(
+        query.height(replace(terrain, observed=observed), xy), expected, 0.02
+    )
 
 
 def test_unknown_ground_is_like_that_below_and_what_is_known_is_as_it_is():
     terrain, (x, y, yaw) = world(), POSES[0]
-    believed = replace(terrain, belief=begin(DISC, terrain, *at(x, y, yaw)))
+    observed_map = replace(terrain, observed=init(DISC, terrain, *at(x, y, yaw)))
     below = query.surface(terrain, jnp.array([x, y]))
-    far = query.surface(believed, jnp.array([[40.0, 40.0], [48.0, 40.0]]))
+    far = query.surface(observed_map, jnp.array([[40.0, 40.0], [48.0, 40.0]]))
     np.testing.assert_array_equal(far.semantic, below.semantic)
     np.testing.assert_array_equal(far.friction, below.friction)
     near = jnp.array([[5.0, 5.0], [-5.0, 5.0], [7.0, -2.0]])
-    chex.assert_trees_all_equal(query.surface(believed, near), query.surface(terrain, near))
-    seen = [patches.query(ground, *at(x, y, yaw)) for ground in (believed, terrain)]
+    chex.assert_trees_all_equal(query.surface(observed_map, near), query.surface(terrain, near))
+    seen = [patches.query(ground, *at(x, y, yaw)) for ground in (observed_map, terrain)]
     chex.assert_trees_all_equal(*seen)
 
 
@@ -123,8 +125,10 @@ def test_rocks_are_there_once_their_middle_is_seen():
     yaw = jnp.zeros(2)
     assert obstacles.collides(terrain, poses, yaw, 4.6, 2.2).all()
     for pose, expected in ((POSES[0], [True, False]), (POSES[2], [False, False])):
-        believed = replace(terrain, belief=begin(DISC, terrain, *at(*pose)))
-        np.testing.assert_array_equal(obstacles.collides(believed, poses, yaw, 4.6, 2.2), expected)
+        observed_map = replace(terrain, observed=init(DISC, terrain, *at(*pose)))
+        np.testing.assert_array_equal(
+            obstacles.collides(observed_map, poses, yaw, 4.6, 2.2), expected
+        )
 
 
 @pytest.mark.parametrize("config", [DISC, SECTOR])
@@ -136,12 +140,12 @@ def test_what_was_not_seen_does_not_matter(config):
         elevation=jnp.where(vertices(known), terrain.elevation, 9.0),
         obstacles=terrain.obstacles.at[:, 1, 0].add(20.0),
     )
-    beliefs = along(config, terrain, POSES), along(config, other, POSES)
-    chex.assert_trees_all_equal(*beliefs)
+    observations = along(config, terrain, POSES), along(config, other, POSES)
+    chex.assert_trees_all_equal(*observations)
     xy = jnp.asarray(np.random.default_rng(0).uniform(-64, 64, (500, 2)), jnp.float32)
     seen = [
         (query.surface(ground, xy), query.height(ground, xy))
-        for ground in (replace(g, belief=beliefs[0]) for g in (terrain, other))
+        for ground in (replace(g, observed=observations[0]) for g in (terrain, other))
     ]
     chex.assert_trees_all_equal(*seen)
     assert not np.allclose(query.height(terrain, xy), query.height(other, xy))
@@ -156,8 +160,10 @@ def test_many_vehicles_on_many_worlds_are_each_their_own_in_one_program():
     def height(worlds, positions, yaws):
         def one(world, position, yaw):
             ground = terrain.select(world)
-            belief = reveal.begin(SECTOR, ground, position, yaw)
-            return belief, query.height(replace(ground, belief=belief), jnp.array([20.0, 0.0]))
+            observed = sensing.init(SECTOR, ground, position, yaw)
+            return observed, query.height(
+                replace(ground, observed=observed), jnp.array([20.0, 0.0])
+            )
 
         return jax.vmap(one)(worlds, positions, yaws)
 
@@ -167,22 +173,25 @@ def test_many_vehicles_on_many_worlds_are_each_their_own_in_one_program():
         found = height(jnp.array(worlds), *stacked)
         for i, (number, pose) in enumerate(zip(worlds, poses, strict=True)):
             ground = terrain.select(jnp.int32(number))
-            belief = begin(SECTOR, ground, *pose)
-            alone = belief, query.height(replace(ground, belief=belief), jnp.array([20.0, 0.0]))
+            observed = init(SECTOR, ground, *pose)
+            alone = (
+                observed,
+                query.height(replace(ground, observed=observed), jnp.array([20.0, 0.0])),
+            )
             chex.assert_trees_all_close(jax.tree.map(lambda x, i=i: x[i], found), alone, atol=1e-5)
 
 
 def test_what_has_no_sense_is_refused():
     for wrong, message in (
-        ({"range": 0.0}, "range: expected more than 0 m"),
-        ({"range": np.nan}, "range: expected more than 0 m"),
-        ({"field_of_view": 7.0}, "field_of_view: expected more than 0 and up to 2 pi rad"),
+        ({"range": 0.0}, "range: expected more than 0, found"),
+        ({"range": np.nan}, "range: expected more than 0, found"),
+        ({"field_of_view": 7.0}, "field_of_view: expected more than 0 and at most 6.28319"),
         ({"cells": 0}, "cells: expected at least 1"),
     ):
         with pytest.raises(ValueError, match=message):
-            RevealConfig(**wrong)
-    with pytest.raises(ValueError, match=r"reveal.cells: expected at least 23 on a map of 128 x"):
-        reveal.check(RevealConfig(range=12.0, cells=16), world())
-    reveal.check(RevealConfig(range=12.0, cells=23), world())
-    reveal.check(RevealConfig(cells=1), world())
-    assert begin(RevealConfig(), world(), *at(*POSES[0])) is None
+            SensingConfig(**wrong)
+    with pytest.raises(ValueError, match=r"sensing.cells: expected at least 23 on a map of 128 x"):
+        sensing.check(SensingConfig(range=12.0, cells=16), world())
+    sensing.check(SensingConfig(range=12.0, cells=23), world())
+    sensing.check(SensingConfig(cells=1), world())
+    assert init(SensingConfig(), world(), *at(*POSES[0])) is None

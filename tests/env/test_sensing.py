@@ -13,10 +13,10 @@ from vertiwm_jax.env.observation import LAYOUT, arcs_ahead
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import TerminationReason
-from vertiwm_jax.terrain.reveal import RevealConfig
+from vertiwm_jax.terrain.sensing import SensingConfig
 
 KEY = jax.random.key(0)
-REVEALED = NavigationConfig(reveal=RevealConfig(range=12.0))
+REVEALED = NavigationConfig(sensing=SensingConfig(range=12.0))
 TASK = task((-30.0, 0.0), (30.0, 0.0))
 AHEAD = jnp.array([0.6, 0.0])
 
@@ -45,7 +45,7 @@ def test_what_was_not_seen_is_neither_observed_nor_missed():
     env, params = bicycle_env(ground(hills()), TASK, REVEALED)
     other = replace(params, terrain=stepped(6.0))
     (seen, states), (found, others) = drive(env, params), drive(env, other)
-    chex.assert_trees_all_equal(states.belief.known, others.belief.known)
+    chex.assert_trees_all_equal(states.observed.known, others.observed.known)
     # Cells are 2 m wide, and seen by their middle.
     x = np.asarray(states.vehicle.position[:, 0])
     far, near = x < 6.0 - 12.0, x > 6.0 - 12.0 + 2.0
@@ -67,7 +67,7 @@ def test_the_vehicle_follows_the_true_ground():
 
 
 def test_sensors_that_see_everything_show_what_a_known_map_shows():
-    everything = NavigationConfig(reveal=RevealConfig(range=200.0))
+    everything = NavigationConfig(sensing=SensingConfig(range=200.0))
     rocks = [[9.0, 2.0, 4.0, 4.0, 2.0]]
     revealed, known = (
         np.array(drive(*bicycle_env(ground(hills(), rocks), TASK, config))[0])
@@ -83,7 +83,7 @@ def test_sensors_that_see_everything_show_what_a_known_map_shows():
 def test_a_known_map_has_no_belief():
     env, params = bicycle_env(ground(hills()), TASK)
     state = env.reset_env(KEY, params)[1]
-    assert state.belief is None and params.believed(state).belief is None
+    assert state.observed is None and params.observed_map(state).observed is None
 
 
 def test_a_wall_is_seen_when_it_comes_into_range():
@@ -96,7 +96,7 @@ def test_a_wall_is_seen_when_it_comes_into_range():
     assert TerminationReason(int(states.ending[-1])) == TerminationReason.COLLIDED
     # An episode that is over stays as it is.
     over = np.flatnonzero(np.asarray(states.ending) != TerminationReason.RUNNING)
-    first, last = (jax.tree.map(lambda x, i=i: x[i], states.belief) for i in over[[0, -1]])
+    first, last = (jax.tree.map(lambda x, i=i: x[i], states.observed) for i in over[[0, -1]])
     chex.assert_trees_all_equal(first, last)
 
 
@@ -110,18 +110,18 @@ def test_many_are_stepped_in_one_program_and_begin_anew_with_what_they_see_there
     for i in range(1, 6):
         before = states
         observation, states, *_ = step(jax.random.key(i), states, params)
-        grown = np.asarray(states.belief.known | before.belief.known == states.belief.known)
+        grown = np.asarray(states.observed.known | before.observed.known == states.observed.known)
         assert grown.all() == (i < 5)
-    first = set(map(bytes, np.asarray(params.starts.belief.known)))
-    assert {bytes(known) for known in np.asarray(states.belief.known)} <= first
+    first = set(map(bytes, np.asarray(params.starts.observed.known)))
+    assert {bytes(known) for known in np.asarray(states.observed.known)} <= first
     assert set(map(bytes, np.asarray(observation))) <= set(
         map(bytes, np.asarray(params.start_observation))
     )
 
 
 def test_what_does_not_go_together_is_refused():
-    with pytest.raises(ValueError, match=r"reveal.range: expected inf with embeddings"):
-        NavigationConfig(embeddings=True, reveal=RevealConfig(range=12.0))
-    coarse = NavigationConfig(reveal=RevealConfig(range=12.0, cells=8))
-    with pytest.raises(ValueError, match=r"reveal.cells: expected at least 23"):
+    with pytest.raises(ValueError, match=r"sensing.range: expected inf with embeddings"):
+        NavigationConfig(embeddings=True, sensing=SensingConfig(range=12.0))
+    coarse = NavigationConfig(sensing=SensingConfig(range=12.0, cells=8))
+    with pytest.raises(ValueError, match=r"sensing.cells: expected at least 23"):
         bicycle_env(ground(hills()), TASK, coarse)

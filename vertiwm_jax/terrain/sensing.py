@@ -10,8 +10,7 @@ import numpy as np
 
 from vertiwm_jax.config import Bounds, ConfigError, Count, Positive, settings
 from vertiwm_jax.terrain import query
-from vertiwm_jax.terrain.belief import MapBelief
-from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.map import ObservedMap, TerrainMap
 
 NEAR = 4.0
 """Distance, m, within which a vehicle knows the ground in all directions."""
@@ -19,7 +18,7 @@ _RINGS, _DIRECTIONS = 6, 12  # of the places in view that the plane is laid thro
 
 
 @settings
-class RevealConfig:
+class SensingConfig:
     """What sensors see of the map; by default all of it is known from the start."""
 
     range: Positive = math.inf
@@ -35,7 +34,7 @@ class RevealConfig:
         return math.isfinite(self.range)
 
 
-def check(config: RevealConfig, terrain: TerrainMap) -> None:
+def check(config: SensingConfig, terrain: TerrainMap) -> None:
     """`ValueError` if cells are so large that a vehicle may not see the cell that it stands in."""
     rows, columns = terrain.elevation.shape[-2:]
     width, height = (float(terrain.resolution) * (n - 1) for n in (columns, rows))
@@ -43,35 +42,35 @@ def check(config: RevealConfig, terrain: TerrainMap) -> None:
     if config.partial and math.hypot(width, height) / config.cells > 2 * near:
         least = math.ceil(math.hypot(width, height) / (2 * near))
         raise ConfigError(
-            f"reveal.cells: expected at least {least} on a map of {width:g} x {height:g} m with a "
+            f"sensing.cells: expected at least {least} on a map of {width:g} x {height:g} m with a "
             f"range of {config.range:g} m, found {config.cells}"
         )
 
 
-def begin(
-    config: RevealConfig, terrain: TerrainMap, position: jax.Array, yaw: jax.Array
-) -> MapBelief | None:
-    """The first belief at `[3]` p_world, m, and `[]` yaw, rad; None if all is known."""
+def init(
+    config: SensingConfig, terrain: TerrainMap, position: jax.Array, yaw: jax.Array
+) -> ObservedMap | None:
+    """What is known at first, at `[3]` p_world, m, and `[]` yaw, rad; None if all is known."""
     if not config.partial:
         return None
     below = query.surface(terrain, position[:2])
-    nothing = MapBelief(
+    nothing = ObservedMap(
         known=jnp.zeros((config.cells, config.cells), bool),
         plane=jnp.stack([below.height, *jnp.zeros(2)]),
         semantic=below.semantic,
         friction=below.friction,
     )
-    return look(config, terrain, nothing, position, yaw)
+    return update(config, terrain, nothing, position, yaw)
 
 
-def look(
-    config: RevealConfig,
+def update(
+    config: SensingConfig,
     terrain: TerrainMap,
-    belief: MapBelief,
+    observed: ObservedMap,
     position: jax.Array,
     yaw: jax.Array,
-) -> MapBelief:
-    """The belief after looking around at `[3]` p_world, m, and `[]` yaw, rad.
+) -> ObservedMap:
+    """What is known after looking around at `[3]` p_world, m, and `[]` yaw, rad.
 
     A cell is seen where its middle is, and stays known. Unknown ground is assumed to lie in the
     least-squares plane through the ground in view, with class and friction of the ground below the
@@ -88,10 +87,10 @@ def look(
         ahead = cos * east + (sin * north)[:, None]
         in_view = ahead >= math.cos(config.field_of_view / 2) * jnp.sqrt(squared)
         seen &= in_view | (squared <= NEAR**2)
-    belief = replace(belief, known=belief.known | seen)
+    observed = replace(observed, known=observed.known | seen)
 
-    # As believed, so that places in cells that are not seen tell nothing.
-    ground = replace(terrain, belief=belief)
+    # As observed, so that places in cells that are not seen tell nothing.
+    ground = replace(terrain, observed=observed)
     forward, left = _places(config)
     x, y = cos * forward - sin * left, sin * forward + cos * left
     heights = query.height(ground, position[:2] + jnp.stack([x, y], axis=-1))
@@ -100,14 +99,14 @@ def look(
     slope = jnp.stack([cos * rise - sin * bank, sin * rise + cos * bank])
     below = query.surface(ground, position[:2])
     return replace(
-        belief,
+        observed,
         plane=jnp.append(level - jnp.sum(slope * position[:2]), slope),
         semantic=below.semantic,
         friction=below.friction,
     )
 
 
-def _places(config: RevealConfig) -> tuple[np.ndarray, np.ndarray]:
+def _places(config: SensingConfig) -> tuple[np.ndarray, np.ndarray]:
     """m ahead and m to the left `[P]`, evenly over what is in view."""
     rings = config.range * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
     turns = config.field_of_view * ((np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS - 0.5)
