@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from vertiwm_jax.mechanics.vehicle import Vehicle as Vehicle
     from vertiwm_jax.mechanics.vehicle import load_vehicle as load_vehicle
     from vertiwm_jax.models.registry import load_model as load_model
+    from vertiwm_jax.planning.mppi import MPPI as MPPI
     from vertiwm_jax.rl.experiment import train as train
-    from vertiwm_jax.rl.mppi import MPPI as MPPI
     from vertiwm_jax.rl.policy import Policy as Policy
     from vertiwm_jax.rl.policy import load_policy as load_policy
     from vertiwm_jax.state import Command as Command
@@ -34,7 +34,7 @@ _PUBLIC = {
     "Agent": "env.agent",
     "Command": "state",
     "Dynamics": "dynamics",
-    "MPPI": "rl.mppi",
+    "MPPI": "planning.mppi",
     "Policy": "rl.policy",
     "load_policy": "rl.policy",
     "train": "rl.experiment",

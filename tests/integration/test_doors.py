@@ -24,9 +24,9 @@ from vertiwm_jax.models import files as model_files
 from vertiwm_jax.models.config import ModelConfig
 from vertiwm_jax.models.registry import load_model
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
+from vertiwm_jax.planning.improvement import ImprovementConfig
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
-from vertiwm_jax.rl.planning import PlanningConfig
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
@@ -279,7 +279,7 @@ def test_a_policy_of_a_known_map_drives_on_one_that_is_revealed(run):
 @pytest.mark.parametrize("planning", [True, False, None])
 def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path):
     (tmp_path / "policy").symlink_to(run / "policy")
-    for of_run in (PlanningConfig(candidates=3), None):
+    for of_run in (ImprovementConfig(candidates=3), None):
         config = replace(configuration.load(PPOTraining, run / "config.yaml"), planning=of_run)
         configuration.save(config, tmp_path / "config.yaml")
         asked = [] if planning is None else ["--planning", str(planning)]
@@ -289,7 +289,7 @@ def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path):
         plans = bool(of_run) if planning is None else planning
         assert ("ppo with planning" in policies) == plans and "ppo" in policies
         if plans:
-            assert policies["ppo with planning"].config == (of_run or PlanningConfig())
+            assert policies["ppo with planning"].config == (of_run or ImprovementConfig())
     if planning is not None:
         with pytest.raises(ValueError, match="planning: is of the policy of a run, found mppi"):
             evaluate.Navigation("mppi", planning=planning)

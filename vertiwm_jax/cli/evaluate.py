@@ -35,11 +35,11 @@ from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, hmmwv
 from vertiwm_jax.models.config import SoilSource
 from vertiwm_jax.models.registry import ModelName, load_fitted, load_model
+from vertiwm_jax.planning.improvement import ImprovementConfig
+from vertiwm_jax.planning.mppi import MPPI, MPPIConfig
+from vertiwm_jax.planning.shooting import Shooting, ShootingConfig
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import TrainConfig
-from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
-from vertiwm_jax.rl.planning import PlanningConfig
-from vertiwm_jax.rl.shooting import Shooting, ShootingConfig
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.simulators import processes
 from vertiwm_jax.terrain import files
@@ -317,7 +317,7 @@ def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:
         sensing = replace(config.navigation.sensing, range=command.sensing_range)
         config = replace(config, navigation=replace(config.navigation, sensing=sensing))
     if command.planning is not None:
-        planning = config.planning or PlanningConfig()
+        planning = config.planning or ImprovementConfig()
         config = replace(config, planning=planning if command.planning else None)
     if command.suites:
         config = replace(config, worlds=None)

@@ -26,9 +26,9 @@ from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
 from vertiwm_jax.models.registry import Imagined, ModelName, load_encoders, load_model
 from vertiwm_jax.perception.features import Encoders
+from vertiwm_jax.planning.improvement import ImprovementConfig, PolicyImprovement
 from vertiwm_jax.rl import policy
 from vertiwm_jax.rl.algorithm import LearningConfig, PolicyAlgorithm
-from vertiwm_jax.rl.planning import Planner, PlanningConfig
 from vertiwm_jax.rl.policy import Base, PolicyConfig, load_policy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
@@ -115,7 +115,7 @@ class TrainConfig(TaskConfig, ABC):
     """Steps of 0.1 s that an action is held while learning; `transitions` count actions."""
     base: Base = "look ahead"
     """The controller that the policy learns to correct; it acts at every step."""
-    planning: PlanningConfig | None = None
+    planning: ImprovementConfig | None = None
     """How the policy plans in tests, besides driving as it is; learning does not need it."""
     loop: LoopConfig = LoopConfig()
     """Seeds and checkpoints."""
@@ -418,7 +418,7 @@ def learned(config: TrainConfig, folder: Path) -> Rows:
         rows[name] = trained.acting
         if config.planning:
             moves, weights = dynamics(config, config.planning.model)
-            rows[f"{name} with planning"] = Planner(
+            rows[f"{name} with planning"] = PolicyImprovement(
                 env=NavigationEnv(moves, config.navigation),
                 dynamics=weights,
                 policy=trained.learned,

@@ -1,15 +1,11 @@
 """Planning without a learned policy: model predictive path integral control."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.config import Positive, settings
-from vertiwm_jax.env.agent import Now
-from vertiwm_jax.rl.imagining import Plan, around
-from vertiwm_jax.rl.open_loop import OpenLoop, OpenLoopConfig
+from vertiwm_jax.planning.planner import OpenLoopConfig, OpenLoopPlanner
 
 
 @settings
@@ -21,7 +17,7 @@ class MPPIConfig(OpenLoopConfig):
 
 
 @struct.dataclass
-class MPPI(OpenLoop):
+class MPPI(OpenLoopPlanner):
     """Drives by the mean of many imagined plans, weighed by what each of them returns.
 
     Plans are drawn about the one that was intended, moved on by a decision; each counts
@@ -32,11 +28,7 @@ class MPPI(OpenLoop):
 
     config: MPPIConfig = struct.field(pytree_node=False, default=MPPIConfig())
 
-    def plan(self, now: Now, memory: Plan, key: jax.Array) -> Plan:
-        """The plans' mean."""
-        noise_key, key = jax.random.split(key)
-        config = self.config
-        candidates = around(self.intended(memory), config.candidates, config.spread, noise_key)
-        returns = self.returns(now, memory, candidates, key)
-        weights = jax.nn.softmax(returns / config.temperature)
-        return replace(memory, corrections=jnp.tensordot(weights, candidates, axes=1))
+    def chosen(self, plans: jax.Array, returns: jax.Array) -> jax.Array:
+        """`[D, 2]` the mean of the plans."""
+        weights = jax.nn.softmax(returns / self.config.temperature)
+        return jnp.tensordot(weights, plans, axes=1)

@@ -15,7 +15,7 @@ from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
-from vertiwm_jax.rl.mppi import MPPI, MPPIConfig
+from vertiwm_jax.planning.mppi import MPPI, MPPIConfig
 from vertiwm_jax.terrain.sensing import SensingConfig
 
 CONFIG = NavigationConfig(horizon_seconds=15.0)
@@ -124,13 +124,15 @@ def test_after_a_plan_it_goes_on_to_the_goal_at_a_steady_pace(blocked):
     straight = route.straight(env.config.route, params.terrain, params.starts.goal[:, :2])
     params = replace(params, routes=straight)
     planner = driver(env, pace=5.0, discount=0.9)
-    _, state = env.start(params, jnp.int32(0))
+    observation, state = env.start(params, jnp.int32(0))
     apart = jnp.linalg.norm(state.goal - state.vehicle.position)
     toward = (state.goal - state.vehicle.position) / apart
     near = state.goal - (8.0 + 3 * 4.0) * toward  # three decisions of 4 m from the goal's edge
     state = replace(state, vehicle=replace(state.vehicle, position=near))
     expected = (1 + 0.9 + 0.81) * 50.0 * 4.0 + 0.729 * 3000.0
-    assert float(planner.expected(params, state)) == pytest.approx(expected, rel=2e-3)
+    assert float(planner.expected(Now(params, state, observation))) == pytest.approx(
+        expected, rel=2e-3
+    )
 
 
 def test_many_decide_as_each_alone(blocked):

@@ -16,8 +16,8 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.planning.improvement import ImprovementConfig, PolicyImprovement
 from vertiwm_jax.rl.learned import Corrected
-from vertiwm_jax.rl.planning import Planner, PlanningConfig
 
 CONFIG = NavigationConfig(horizon_seconds=15.0)
 KEY = jax.random.key(0)
@@ -41,7 +41,7 @@ def blocked():
 
 
 def planner(env, correction=(0.0, 0.0), value=0.0, base=True, **config):
-    return Planner(
+    return PolicyImprovement(
         env=env,
         dynamics=BICYCLE,
         policy=Always(jnp.array(correction)),
@@ -49,7 +49,7 @@ def planner(env, correction=(0.0, 0.0), value=0.0, base=True, **config):
         base=StraightToGoal(CONFIG) if base else None,
         interval=8,
         discount=0.9,
-        config=PlanningConfig(**config),
+        config=ImprovementConfig(**config),
     )
 
 
@@ -79,7 +79,7 @@ def test_a_future_is_worth_its_rewards_and_what_is_expected_at_its_end(blocked):
     env, params = blocked
     driver = planner(env, correction=(0.1, -0.3), value=7.0, decisions=3)
     now, first = begin(env, params), jnp.array([0.2, 0.3])
-    found = jax.jit(driver.imagine)(now, first, KEY)
+    found = jax.jit(driver.imagine)(now, first[None], KEY)
     repeated, total, actions = (
         ActionRepeat(env, 8, driver.base),
         0.0,
@@ -105,7 +105,7 @@ def test_nothing_is_expected_after_the_end(blocked, ending):
     returns = [
         float(
             planner(env, value=value, decisions=4).imagine(
-                Now(params, state, now.observation), jnp.array([1.0, 0.0]), KEY
+                Now(params, state, now.observation), jnp.array([[1.0, 0.0]]), KEY
             )
         )
         for value in (0.0, 1e6)
@@ -137,4 +137,4 @@ def test_its_model_follows_the_vehicle():
 )
 def test_settings_that_make_no_sense_are_refused(field, value):
     with pytest.raises(ValueError, match=rf"{field}: expected at least \d, found {value}"):
-        PlanningConfig(**{field: value})
+        ImprovementConfig(**{field: value})

@@ -16,8 +16,7 @@ from vertiwm_jax.env.task import TaskState
 from vertiwm_jax.env.termination import TerminationReason, edge_distance
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.models.registry import Imagined
-from vertiwm_jax.rl.imagining import Plan, around
-from vertiwm_jax.rl.open_loop import OpenLoop, OpenLoopConfig
+from vertiwm_jax.planning.planner import OpenLoopConfig, OpenLoopPlanner, Plan, around
 from vertiwm_jax.terrain import obstacles
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -27,7 +26,6 @@ class ShootingConfig(OpenLoopConfig):
     """What `Shooting` imagines before it decides, and how it improves the best of it."""
 
     candidates: Count = 32
-    """Plans compared at every decision; the first is what was intended anyway."""
     improved: Count = 4
     """How many of them, the best, are improved."""
     steps: CountOrZero = 4
@@ -49,7 +47,7 @@ class ShootingConfig(OpenLoopConfig):
 
 
 @struct.dataclass
-class Shooting(OpenLoop):
+class Shooting(OpenLoopPlanner):
     """Drives by the best imagined plan, after its gradient has improved it.
 
     Plans are drawn about the one that was intended, moved on by a decision. Those that return most
@@ -65,12 +63,11 @@ class Shooting(OpenLoop):
     def plan(self, now: Now, memory: Plan, key: jax.Array) -> Plan:
         """The best plan."""
         config = self.config
-        drawn = around(self.intended(memory), config.candidates, config.spread, key)
+        drawn = around(self.intended(now, memory), config.candidates, config.spread, key)
         worth = self.worth(now, memory, drawn)
         best = drawn[jax.lax.top_k(worth, config.improved)[1]]
         plans = jnp.concatenate([best, self.improve(now, memory, best)])
-        chosen = jnp.argmax(self.worth(now, memory, plans))
-        return replace(memory, corrections=plans[chosen])
+        return replace(memory, corrections=self.chosen(plans, self.worth(now, memory, plans)))
 
     def worth(self, now: Now, memory: Plan, plans: jax.Array) -> jax.Array:
         """`[N]` the `smooth_return` of plans `[N, D, 2]` from where the vehicle is."""
@@ -82,17 +79,17 @@ class Shooting(OpenLoop):
         Plans stay within [-1, 1], and as they are where a gradient is not finite.
         """
         now = self.inside(now, memory)
-        optimiser = optax.adam(self.config.rate)
+        optimizer = optax.adam(self.config.rate)
         slope = jax.vmap(jax.grad(self.smooth_return, argnums=1), (None, 0))
 
         def ascend(carry: tuple[jax.Array, optax.OptState], _: None) -> tuple[tuple, None]:
             plans, memory = carry
             gradient = slope(now, plans)
             usable = jnp.all(jnp.isfinite(gradient), axis=(1, 2), keepdims=True)
-            updates, memory = optimiser.update(jnp.where(usable, -gradient, 0.0), memory)
+            updates, memory = optimizer.update(jnp.where(usable, -gradient, 0.0), memory)
             return (jnp.clip(plans + cast(jax.Array, updates), -1.0, 1.0), memory), None
 
-        carry = plans, optimiser.init(plans)
+        carry = plans, optimizer.init(plans)
         return jax.lax.scan(ascend, carry, length=self.config.steps)[0][0]
 
     def smooth_return(self, now: Now, plan: jax.Array) -> jax.Array:
@@ -122,7 +119,7 @@ class Shooting(OpenLoop):
         actions = jnp.repeat(plan, self.config.interval, axis=0)
         start = now.state, jnp.float32(1), jnp.float32(0)
         (end, weight, total), _ = jax.lax.scan(advance, start, actions)
-        return total + weight * self.expected(task, end)
+        return total + weight * self.expected(replace(now, state=end))
 
     def _nearness(
         self, terrain: TerrainMap, vehicle: Vehicle, state: TaskState, distance: jax.Array

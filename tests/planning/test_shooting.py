@@ -12,7 +12,7 @@ from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
-from vertiwm_jax.rl.shooting import Shooting, ShootingConfig
+from vertiwm_jax.planning.shooting import Shooting, ShootingConfig
 
 CONFIG = NavigationConfig(horizon_seconds=15.0)
 KEY = jax.random.key(0)
@@ -122,7 +122,7 @@ def test_what_it_intends_is_worth_more_than_any_plan_it_drew(blocked):
     planner = driver(env)
     now, memory = started(env, params, planner, drawn(1)[0])
     noise = jax.random.normal(KEY, (8, 4, 2)).at[0].set(0.0)
-    plans = jnp.clip(planner.intended(memory) + 0.5 * noise, -1.0, 1.0)
+    plans = jnp.clip(planner.intended(now, memory) + 0.5 * noise, -1.0, 1.0)
     decided = jax.jit(planner.plan)(now, memory, KEY).corrections
     worth = jax.jit(planner.worth)(now, memory, jnp.concatenate([plans, decided[None]]))
     assert float(worth[-1]) > float(worth[:-1].max()) + 1.0
