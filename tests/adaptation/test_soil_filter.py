@@ -13,11 +13,10 @@ from vertiwm_jax.mechanics.kinematic import rest_on_ground
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.models.registry import load_model
-from vertiwm_jax.networks import soil_predictor
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import query
-from vertiwm_jax.terrain.soil import PRESETS
+from vertiwm_jax.terrain.soil import PRESETS, to_unit
 
 GRASS, MUD, SAND = 3, 7, 8
 EFFECT = 0.1 * np.random.default_rng(0).normal(size=(6, 6))
@@ -41,7 +40,7 @@ class Linear:
 
     def step(self, params, terrain, history, state, command):
         kind = query.surface(terrain, state.position[:2]).semantic
-        logits = logit(soil_predictor.shares(query.soil(terrain, kind)))
+        logits = logit(to_unit(query.soil(terrain, kind)))
         last = history % self.period == self.period - 1
         moved = jnp.where(last, params @ logits, 0.0)
         position = state.position + moved[:3] + jnp.stack([0.1 * command.speed, 0.0, 0.0])

@@ -12,10 +12,9 @@ from vertiwm_jax.learning.dataset import Auxiliary, Drives
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import GRAVITY, hmmwv
 from vertiwm_jax.mechanics.wheel import Wheel
-from vertiwm_jax.networks import soil_predictor
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import query
-from vertiwm_jax.terrain.soil import PRESETS
+from vertiwm_jax.terrain.soil import PRESETS, to_unit
 
 MUD = 7
 TERRAIN = terrain_map.build(np.full((65, 65), 4.0), np.full((8, 8), MUD))
@@ -32,13 +31,13 @@ class Slowed:
     def step(self, params, terrain, history, state, command):
         kind = query.surface(terrain, state.position[:2]).semantic
         soil = query.soil(terrain, kind)
-        ahead = 0.1 * command.speed * soil_predictor.shares(soil)[1]
+        ahead = 0.1 * command.speed * to_unit(soil)[1]
         return replace(state, position=state.position.at[0].add(ahead)), history
 
 
 def driven() -> Drives:
     """Two drives by `Slowed` on mud, of which the second ends early."""
-    share = float(soil_predictor.shares(PRESETS["mud"])[1])
+    share = float(to_unit(PRESETS["mud"])[1])
     state = np.zeros((2, STEPS + 1, 12), np.float32)
     state[..., 0] = -10 + 0.1 * 2.0 * share * np.arange(STEPS + 1)
     control = np.tile(np.float32([2.0, 0.0]), (2, STEPS, 1))
@@ -57,7 +56,7 @@ def test_predictions_get_better_as_the_drive_goes_on():
     index = adaptation.windows_on_soil(drives, TERRAIN)
     found = adaptation.errors(Slowed(), None, TERRAIN, wrong, adapted, drives, index)
     means = {name: [x.mean for _, x in rows.values()] for name, rows in found.items()}
-    shares = [float(soil_predictor.shares(PRESETS[name])[1]) for name in ("mud", "snow")]
+    shares = [float(to_unit(PRESETS[name])[1]) for name in ("mud", "snow")]
     missed = 1.6 * 2.0 * (shares[0] - shares[1])
     assert [n for n, _ in found["true"].values()] == [5, 1]
     np.testing.assert_allclose(means["true"], 0, atol=1e-5)

@@ -7,12 +7,11 @@ import pytest
 
 from vertiwm_jax.learning.autoencoders import AutoencoderConfig, PatchData, Places
 from vertiwm_jax.learning.soils import SoilProblem
-from vertiwm_jax.networks import soil_predictor
 from vertiwm_jax.networks.encoder import LATENT_CHANNELS
-from vertiwm_jax.networks.soil_predictor import BOUNDS, SoilPredictor
+from vertiwm_jax.networks.soil_predictor import SoilPredictor
 from vertiwm_jax.perception.features import init_pair
 from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain.soil import PRESETS
+from vertiwm_jax.terrain.soil import BOUNDS, PRESETS, to_unit
 
 NAMES = terrain_map.STANDARD.names
 GRASS, MUD, SNOW = (NAMES.index(name) for name in ("grass", "mud", "snow"))
@@ -37,14 +36,14 @@ def data(*kinds):
 
 def test_shares_say_where_in_its_bounds_a_soil_lies():
     predicted = SoilPredictor().apply(params()["soil"], LATENT + 1.0, jnp.float32(0))
-    shares = soil_predictor.shares(predicted)
+    shares = to_unit(predicted)
     assert shares.shape == (6,) and np.all((shares > 0) & (shares < 1))
     low, high = (
         replace(PRESETS["mud"], **{name: np.float32(bound[i]) for name, bound in BOUNDS.items()})
         for i in (0, 1)
     )
-    np.testing.assert_allclose(soil_predictor.shares(low), 0, atol=1e-6)
-    np.testing.assert_allclose(soil_predictor.shares(high), 1, atol=1e-6)
+    np.testing.assert_allclose(to_unit(low), 0, atol=1e-6)
+    np.testing.assert_allclose(to_unit(high), 1, atol=1e-6)
 
 
 def test_error_is_of_soil_alone():

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vertiwm_jax.networks.soil_predictor import BOUNDS, SoilPredictor
-from vertiwm_jax.terrain.soil import PRESETS, validate
+from vertiwm_jax.networks.soil_predictor import SoilPredictor
+from vertiwm_jax.terrain.soil import BOUNDS, PRESETS, validate
 
 MODEL = SoilPredictor()
 LATENT = jax.random.normal(jax.random.key(1), (4, 16, 16, 18))

@@ -16,10 +16,10 @@ from vertiwm_jax.adaptation import kalman
 from vertiwm_jax.adaptation.kalman import Gaussian
 from vertiwm_jax.config import Bounds, Count, CountOrZero, Positive, settings
 from vertiwm_jax.dynamics import Dynamics, History, Params
-from vertiwm_jax.networks import soil_predictor
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.soil import from_unit, to_unit
 from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.nesam import Nesam
 
@@ -187,8 +187,8 @@ class SoilFilter:
 
     def _of_map(self, terrain: TerrainMap) -> Gaussian:
         """What the map says, leaves `[K, 6]` and `[K, 6, 6]`."""
-        shares = soil_predictor.shares(query.soils(terrain))
-        mean = logit(jnp.clip(shares, MARGIN, 1 - MARGIN))
+        numbers = to_unit(query.soils(terrain))
+        mean = logit(jnp.clip(numbers, MARGIN, 1 - MARGIN))
         one = self.prior**2 * jnp.eye(mean.shape[1])
         return Gaussian(mean, jnp.broadcast_to(one, (*mean.shape, mean.shape[1])))
 
@@ -203,9 +203,8 @@ class SoilFilter:
 
 def believed(terrain: TerrainMap, belief: SoilBelief) -> TerrainMap:
     """The map with the soils that are believed in: what a model is to drive on."""
-    shares = jax.nn.sigmoid(belief.soils.mean)
     unit_weight = query.soils(terrain).unit_weight
-    return terrain.with_soils(soil_predictor.of_shares(shares, unit_weight))
+    return terrain.with_soils(from_unit(jax.nn.sigmoid(belief.soils.mean), unit_weight))
 
 
 def _check(model: Dynamics, params: Params) -> None:

@@ -9,12 +9,11 @@ import jax.numpy as jnp
 from vertiwm_jax import parallel
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning.autoencoders import AutoencoderConfig, PatchData, Places, near
-from vertiwm_jax.networks import soil_predictor
 from vertiwm_jax.networks.encoder import TerrainEncoder
-from vertiwm_jax.networks.soil_predictor import BOUNDS, SoilPredictor
+from vertiwm_jax.networks.soil_predictor import SoilPredictor
 from vertiwm_jax.terrain import patches, query
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.terrain.soil import Soil
+from vertiwm_jax.terrain.soil import BOUNDS, Soil, to_unit
 
 _ENCODER, _NETWORK = TerrainEncoder(3), SoilPredictor()
 
@@ -60,4 +59,4 @@ class SoilProblem:
         kind = query.surface(world, place.position[:2]).semantic
         true = query.soil(world, kind)
         soft = terrain.deformable[kind].astype(jnp.float32)
-        return soft * (soil_predictor.shares(predicted) - soil_predictor.shares(true)), soft
+        return soft * (to_unit(predicted) - to_unit(true)), soft
