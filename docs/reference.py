@@ -17,7 +17,6 @@ from mkdocs.structure.files import File, Files
 
 import vertiwm_jax
 from vertiwm_jax import config as configuration_files
-from vertiwm_jax.cli.collect import Collect
 from vertiwm_jax.cli.compare import CompareConfig
 from vertiwm_jax.cli.make_logs import MakeLogs
 from vertiwm_jax.config import default_config
@@ -25,6 +24,7 @@ from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.rl.experiment import PPOTraining, SACTraining, TD3Training
+from vertiwm_jax.simulators.collection import CollectConfig
 
 FILES = {"ppo": "ppo", "sac": "sac", "td3": "td3", "fit": "fit_chrono", "compare": "table3"}
 """The YAML file that each of these commands reads if it is told no other."""
@@ -34,7 +34,7 @@ COMMANDS = {
     "td3": TD3Training,
     "fit": FitConfig,
     "compare": CompareConfig,
-    "collect": Collect,
+    "collect": CollectConfig,
     "import_drives --settings": ImportSettings,
     "make_logs": MakeLogs,
     "collect --vehicle": VehicleConfig,

@@ -10,7 +10,6 @@ import pytest
 from doors import door, refusal
 
 from vertiwm_jax import atomic
-from vertiwm_jax.cli import collect
 from vertiwm_jax.env.observation import LAYOUT, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.learning import dataset, schema
@@ -155,11 +154,11 @@ def test_drives_that_end_early_are_tried_again(maps, monkeypatch):
         return Drive([], np.zeros((next(lengths), 2)), "rolled over")
 
     monkeypatch.setattr(collection, "record", short)
-    command = collect.Collect(output=maps, seconds=1.0)
-    task = collect.Task(command, hmmwv(), None, files.load_map(maps), world=0, drive=0)
-    assert len(collect.record(task).control) == 3 and len(set(tried)) == 6
+    command = collection.CollectConfig(output=maps, seconds=1.0)
+    task = collection.Task(command, hmmwv(), None, files.load_map(maps), world=0, drive=0)
+    assert len(collection.record_task(task).control) == 3 and len(set(tried)) == 6
     with pytest.raises(SimulatorError, match="world 0: drive 0: expected a step or more"):
-        collect.record(task)
+        collection.record_task(task)
 
 
 class Scripted:
@@ -260,10 +259,10 @@ def test_a_policy_drives_from_goal_to_goal(maps, encoders):
         np.testing.assert_array_equal(pilot(state), command)
         state = np.append(goal, np.zeros(9)).astype(np.float32)
     assert np.linalg.norm(np.diff(goals, axis=0), axis=-1).min() >= 20
-    command = collect.Collect(output=maps, seconds=2.0)
+    command = collection.CollectConfig(output=maps, seconds=2.0)
     alone = jax.device_get(terrain.subset(np.array([0])))
-    task = collect.Task(command, hmmwv(), (policy, config, encoders), alone, 0, drive=1)
-    drive = collect.record(task)
+    task = collection.Task(command, hmmwv(), (policy, config, encoders), alone, 0, drive=1)
+    drive = collection.record_task(task)
     assert drive.control.shape == (20, 2) and np.all(drive.control[:, 0] == 2.5)
 
 

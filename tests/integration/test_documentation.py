@@ -16,8 +16,8 @@ import tyro
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax.cli import COMMANDS, main
-from vertiwm_jax.cli.collect import Collect
 from vertiwm_jax.rl.experiment import PPOTraining
+from vertiwm_jax.simulators.collection import CollectConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -197,7 +197,7 @@ def test_a_command_that_does_not_exist_would_be_found(reading):
     assert stop.value.code == 2
     with pytest.raises(Understood) as read:
         main("collect", ["--output", "drives"])
-    assert read.value.args == (Collect(Path("drives")),)
+    assert read.value.args == (CollectConfig(Path("drives")),)
     assert len(list(commands())) > 20
 
 

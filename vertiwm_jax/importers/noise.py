@@ -1,13 +1,23 @@
 """Turns simulated drives into logs as a real vehicle would write them: noisy, late, with gaps."""
 
+import csv
+import io
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
+from vertiwm_jax import atomic, froude
+from vertiwm_jax import config as configuration
 from vertiwm_jax.config import Bounds, NotNegative, Positive, settings
+from vertiwm_jax.importers.settings import ImportSettings, Resampling, Table, VehicleSettings
+from vertiwm_jax.learning import schema
+from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig, load
 from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain import files
 
 COLUMNS = (
     "drive", "time", "x", "y", "z", "qx", "qy", "qz", "qw", "speed", "steering",
@@ -30,6 +40,78 @@ class NoiseConfig:
     """s by which the stamp of a pose is late. Stamps of commands are exact."""
     dropped: Annotated[float, Bounds(0, 1, below=True)] = 0.05
     """Share of samples that are lost."""
+
+
+def make_logs(
+    data: Path,
+    output: Path,
+    vehicle: str = HMMWV,
+    noise: NoiseConfig = NoiseConfig(),
+    seed: int = 0,
+) -> tuple[float, list[str]]:
+    """Writes recorded drives as CSV logs, with their maps and the settings to import them.
+
+    Args:
+        data: folder of drives, as `collect` records them.
+        output: folder to make.
+        vehicle: what drove: the name of a vehicle that comes along, or a YAML file of one.
+        noise: what the logs suffer from.
+        seed: decides everything that is random.
+
+    Returns:
+        Seconds that the logs last, and their names without ending.
+    """
+    driven, rng = load(vehicle), np.random.default_rng(seed)
+    sources = sorted(data.glob("*.npz"))
+    if not sources:
+        raise DataError(f"{data}: expected .npz files of drives, found none")
+    rows_written = 0
+    with atomic.new_folder(output) as unfinished:
+        (unfinished / "maps").mkdir()
+        for source in sources:
+            arrays, meta = schema.read(source)
+            rows = _rows(arrays, driven.scale, noise, rng)
+            rows_written += len(rows)
+            atomic.write(unfinished / f"{source.stem}.csv", _text(rows))
+            terrain = files.load_map(schema.find_map(source, meta["map"]))
+            small = froude.scaled(terrain, 1 / driven.scale)
+            files.save(small, unfinished / "maps" / source.name)
+        configuration.save(_settings(driven), unfinished / "settings.yaml")
+    kept = 1 - noise.dropped
+    return rows_written / kept / noise.rate, [source.stem for source in sources]
+
+
+def _rows(
+    arrays: dict[str, np.ndarray], scale: float, config: NoiseConfig, rng: np.random.Generator
+) -> np.ndarray:
+    """`[N, 11]` of `COLUMNS`, one drive after the other."""
+    found = []
+    for number, length in enumerate(arrays["length"]):
+        state, control = arrays["state"][number, : length + 1], arrays["control"][number, :length]
+        rows = logged(state, control, scale, config, rng)
+        found.append(np.insert(rows, 0, number, axis=1))
+    return np.concatenate(found)
+
+
+def _text(rows: np.ndarray) -> str:
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows([int(row[0]), *(f"{value:.6g}" for value in row[1:])] for row in rows)
+    return stream.getvalue()
+
+
+def _settings(driven: VehicleConfig) -> ImportSettings:
+    columns = Table(
+        drive="drive",
+        time="time",
+        position=("x", "y", "z"),
+        quaternion=("qx", "qy", "qz", "qw"),
+        speed="speed",
+        steering="steering",
+    )
+    wheels = VehicleSettings(driven.wheelbase, driven.track, scale=driven.scale)
+    return ImportSettings(wheels, resampling=Resampling(), table=columns)
 
 
 def logged(

@@ -1,33 +1,232 @@
 """Drives that are recorded in a simulator, and the files that keep them."""
 
+import logging
+import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax import atomic
+from vertiwm_jax import config as configuration
+from vertiwm_jax.config import Bounds, ConfigError, Count, settings
 from vertiwm_jax.env.agent import Policy, Reactive
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.learning import schema
-from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.mechanics import vehicle
+from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig
+from vertiwm_jax.models.registry import load_encoders
 from vertiwm_jax.perception.features import Encoders
-from vertiwm_jax.simulators import excitation
+from vertiwm_jax.rl.policy import load_policy
+from vertiwm_jax.runs import Progress
+from vertiwm_jax.simulators import chrono, excitation, processes
+from vertiwm_jax.simulators.builtin import BuiltIn
+from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.simulators.driving import Drive, Ending, Pilot, drive
 from vertiwm_jax.simulators.excitation import MARGIN, within
 from vertiwm_jax.simulators.following import AgentPilot, Followed
-from vertiwm_jax.simulators.protocol import Simulator
+from vertiwm_jax.simulators.protocol import Simulator, SimulatorError
+from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain import files, worlds
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.worlds import Difficulty, Kind, WorldConfig
+
+_log = logging.getLogger(__name__)
 
 LEAST_UPRIGHT = 0.3
 """Cosine of the tilt below which a vehicle has rolled over."""
 LARGEST_SPEED = 30.0
 """m/s, beyond which a simulation has diverged."""
+SHORTEST = 0.8
+"""Share of its time after which a drive that ended early is kept; others are tried again."""
+ATTEMPTS = 6
+
+
+@settings
+class CollectConfig:
+    """Record drives of a vehicle in a simulator as `fit` and `evaluate` read them, a file a world.
+
+    The same command goes on where it was stopped: worlds whose file is there are not driven again.
+    """
+
+    output: Path
+    """Folder for the files; their maps are in its folder `maps`."""
+    simulator: Literal["builtin", "chrono"] = "builtin"
+    """What moves the vehicle; Chrono needs PyChrono, and has the HMMWV alone."""
+    vehicle: str = HMMWV
+    """Name of a vehicle that comes along, or a YAML file of one; drives are at its full size."""
+    worlds: Path | None = None
+    """A Verti-Bench checkout or a folder of .npz maps, to drive on all of them."""
+    obstacles: bool = False
+    """Whether the rocks and trees of these maps stand there, in Chrono."""
+    kinds: tuple[Kind, ...] = ("rigid", "deformable", "mixed")
+    """Ground of procedural worlds, unless maps are given."""
+    difficulties: tuple[Difficulty, ...] = ("low", "mid", "high")
+    """How steep they are; there is one world of each kind and difficulty."""
+    repeats: Count = 1
+    """How many of each."""
+    drives: Count = 25
+    """Drives on each world; `fit` learns from the first 20, and tests on 22 to 24."""
+    seconds: Annotated[float, Bounds(STEP_SECONDS)] = 25.0
+    """Duration of a drive."""
+    policy: Path | None = None
+    """Run folder of a policy that drives from goal to goal; the paper's sinusoids by default."""
+    seed: int = 0
+    """Decides everything that is random."""
+    jobs: Count = 1
+    """Processes that simulate."""
+
+    def check(self):
+        if self.obstacles and not (self.worlds and self.simulator == "chrono"):
+            raise ValueError("obstacles: are solid in Chrono alone, and are those of given worlds")
+        if self.vehicle != HMMWV and self.simulator == "chrono":
+            raise ValueError(f"vehicle: expected {HMMWV} in Chrono, found {self.vehicle}")
+        WorldConfig(self.difficulties, self.kinds)
+
+    @property
+    def steps(self) -> int:
+        """Steps of a drive that is not ended early."""
+        return round(self.seconds / STEP_SECONDS)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One drive to record: number `drive` on the selected world of `terrain`, number `world`."""
+
+    config: CollectConfig
+    vehicle: Vehicle
+    learned: tuple[Policy, NavigationConfig, Encoders | None] | None
+    terrain: TerrainMap
+    world: int
+    drive: int
+
+
+def collect(config: CollectConfig) -> None:
+    """Records what the folder lacks, a world after the other."""
+    if config.simulator == "chrono":
+        chrono.modules()
+    driven = vehicle.load(config.vehicle)
+    terrain, learned = _terrain(config, driven.scale), _learned(config)
+    _claim(config)
+    missing = [w for w in range(terrain.worlds) if not _file(config, w).exists()]
+    tasks = (
+        Task(config, driven.vehicle, learned, alone, world, drive)
+        for world in missing
+        for alone in [jax.device_get(terrain.subset(np.array([world])))]
+        for drive in range(config.drives)
+    )
+    total = len(missing) * config.drives * config.steps
+    _log.info("%d of %d worlds are left", len(missing), terrain.worlds)
+    began, done = time.monotonic(), 0
+    with processes.simulating(config.jobs) as mapped, Progress(total, "steps") as progress:
+        found = mapped(record_task, tasks)
+        for world in missing:
+            drives = []
+            for drive in islice(found, config.drives):
+                drives.append(drive)
+                done += len(drive.control)
+                progress.advance(config.steps, f"world {world}, drive {len(drives)}")
+            alone = jax.device_get(terrain.subset(np.array([world])))
+            _write(config, driven, world, alone, drives)
+    if done:
+        _log.info("%s steps, %.0f a second", f"{done:,}", done / (time.monotonic() - began))
+
+
+def record_task(task: Task) -> Drive:
+    """The longest of a few attempts, of which the first that lasts is the last.
+
+    `SimulatorError` if none of them does a single step.
+    """
+    config, tries = task.config, []
+    terrain = jax.device_put(task.terrain)
+    chrono_drives = config.simulator == "chrono"
+    simulator = Chrono(terrain) if chrono_drives else BuiltIn(terrain, task.vehicle)
+    for attempt in range(ATTEMPTS):
+        rng = np.random.default_rng([config.seed, task.world, task.drive, attempt])
+        start = excitation.start(rng, terrain, config.seconds)
+        if task.learned:
+            pilot = to_goals(*task.learned, task.vehicle, terrain, start, rng)
+        else:
+            pilot = excitation.sinusoids(rng, config.steps, float(task.vehicle.steering_limit))
+        tries.append(record(simulator, terrain, start, pilot, config.steps))
+        if len(tries[-1].control) >= SHORTEST * config.steps:
+            break
+    longest = max(tries, key=lambda drive: len(drive.control))
+    if not len(longest.control):
+        raise SimulatorError(
+            f"world {task.world}: drive {task.drive}: expected a step or more, found none in "
+            f"{ATTEMPTS} attempts ({longest.ending})"
+        )
+    return longest
+
+
+def _terrain(config: CollectConfig, scale: float) -> TerrainMap:
+    """All worlds to drive on."""
+    if config.worlds:
+        return files.load_map(config.worlds, scale=scale, obstacles=config.obstacles)
+    count = config.repeats * len(config.difficulties) * len(config.kinds)
+    keys = jax.random.split(jax.random.key(config.seed), count)
+    return worlds.generate(keys, WorldConfig(config.difficulties, config.kinds), scale)
+
+
+def _learned(config: CollectConfig) -> tuple[Policy, NavigationConfig, Encoders | None] | None:
+    """What the run has learned, in host memory, how it is to be driven, and what it sees by."""
+    run = config.policy
+    if run is None:
+        return None
+    policy = load_policy(run).on(vehicle.load(config.vehicle))
+    seen_by = load_encoders(policy.config.weights) if policy.task.embeddings else None
+    acting, seen_by = jax.device_get((policy.acting, seen_by))
+    return acting, policy.task, seen_by
+
+
+def _claim(config: CollectConfig) -> None:
+    """Notes in the folder what it is made by; `ConfigError` if it was made by something else."""
+    file = config.output / "config.yaml"
+    asked = replace(config, output=Path("."), jobs=1)
+    if not file.exists():
+        if config.output.is_dir() and any(config.output.iterdir()):
+            raise ConfigError(f"{file}: expected a new folder, or one of this command")
+        (config.output / "maps").mkdir(parents=True, exist_ok=True)
+        atomic.write(file, configuration.dump(asked))
+    before = configuration.load(CollectConfig, file)
+    for name in (field.name for field in fields(CollectConfig)):
+        was, found = getattr(before, name), getattr(asked, name)
+        if was != found:
+            raise ConfigError(f"{file}: {name}: expected {was} as before, found {found}")
+
+
+def _file(config: CollectConfig, world: int) -> Path:
+    return config.output / f"world_{world:03d}.npz"
+
+
+def _write(
+    config: CollectConfig,
+    driven: VehicleConfig,
+    world: int,
+    terrain: TerrainMap,
+    drives: list[Drive],
+) -> None:
+    """The map, and then the drives, by which a world counts as done."""
+    path = _file(config, world)
+    files.save(terrain, path.parent / "maps" / path.name)
+    meta = {
+        "map": path.name,
+        "simulator": config.simulator,
+        "scale": driven.scale,
+        "policy": str(config.policy) if config.policy else "sinusoids",
+        "world": world,
+        "seed": config.seed,
+    }
+    write(path, drives, config.steps, meta, driven.vehicle)
 
 
 def record(
