@@ -15,7 +15,7 @@ from vertiwm_jax import cli
 from vertiwm_jax import config as configuration
 from vertiwm_jax.rl import experiment, policy
 from vertiwm_jax.rl.experiment import TrainConfig
-from vertiwm_jax.rl.learned import MeanAction
+from vertiwm_jax.rl.learned import DeterministicPolicy
 from vertiwm_jax.terrain import map as terrain_map
 
 Door = Callable[[Sequence[str]], None]
@@ -56,7 +56,7 @@ def refusal(door: Door, *argv: object) -> str:
     return message
 
 
-def untrained(kind: type[TrainConfig], run: Path) -> list[MeanAction]:
+def untrained(kind: type[TrainConfig], run: Path) -> list[DeterministicPolicy]:
     """Policies of random weights, one a seed, left as those of the run beside `config.yaml`."""
     config = configuration.load(kind, run / "config.yaml")
     level = terrain_map.build(np.zeros((129, 129)), np.zeros((1, 1), int))

@@ -51,7 +51,8 @@ def stepped(config, dynamics, params, terrain, encoders=None):
 def test_an_observation_ends_with_the_ground_as_the_encoders_see_it(name, terrain):
     moves = load_model(name, embeddings=True)
     env, seen, state = stepped(CONFIG, *moves, terrain, load_encoders())
-    assert seen.shape == (OBSERVATION_SIZE + 16 * 16 * 36,) and env.senses.image == EMBEDDING_SHAPE
+    assert seen.shape == (OBSERVATION_SIZE + 16 * 16 * 36,)
+    assert env.config.observed.layout.image == EMBEDDING_SHAPE
     expected = jax.jit(embed)(files.load(files.PRETRAINED)[1].encoders[0], terrain, state.vehicle)
     assert float(jnp.std(expected)) > 0.1 and float(jnp.max(jnp.abs(expected))) < OBSERVATION_LIMIT
     tiles = seen[OBSERVATION_SIZE:].reshape(4, 4, 4, 4, 36)

@@ -14,8 +14,8 @@ from vertiwm_jax.env.controllers import LookAhead
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.networks.policy import Actor, Senses
-from vertiwm_jax.rl.learned import Corrected, MeanAction
+from vertiwm_jax.networks.policy import Actor, ObservationLayout
+from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 
 CONFIG = NavigationConfig()
@@ -23,11 +23,11 @@ CONFIG = NavigationConfig()
 
 @pytest.fixture(scope="module")
 def policy():
-    actor = Actor(2, (8,), -0.5, Senses(ARCS))
+    actor = Actor(2, (8,), -0.5, ObservationLayout(ARCS))
     weights = actor.init(jax.random.key(0), jnp.zeros(OBSERVATION_SIZE))
     mean, variance = jnp.zeros(OBSERVATION_SIZE), jnp.ones(OBSERVATION_SIZE)
-    learned = MeanAction(actor, weights, RunningStatistics(mean, variance, jnp.float32(9)))
-    return Corrected(LookAhead(CONFIG), learned)
+    learned = DeterministicPolicy(actor, weights, RunningStatistics(mean, variance, jnp.float32(9)))
+    return ResidualPolicy(LookAhead(CONFIG), learned)
 
 
 @pytest.fixture(scope="module", params=["onnx", "stablehlo"])

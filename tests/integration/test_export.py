@@ -24,11 +24,11 @@ from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZ
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.models.registry import load_encoders
-from vertiwm_jax.networks.policy import Actor, Senses, SquashedActor
+from vertiwm_jax.networks.policy import Actor, ObservationLayout, TanhNormalActor
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.rl.experiment import SACTraining
-from vertiwm_jax.rl.learned import Corrected, MeanAction
+from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
@@ -36,10 +36,10 @@ from vertiwm_jax.terrain.sensing import SensingConfig
 
 CONFIG = NavigationConfig(speed_range=(-1.0, 5.0))
 ACTORS = {
-    "ppo": Actor(2, (8, 6, 5), -0.5, Senses(ARCS)),
-    "sac": SquashedActor(2, (8, 6), -0.5, Senses(ARCS)),
-    "td3": SquashedActor(2, (8,), None, Senses(ARCS)),
-    "embeddings": Actor(2, (8, 6), -0.5, Senses(ARCS, EMBEDDING_SHAPE)),
+    "ppo": Actor(2, (8, 6, 5), -0.5, ObservationLayout(ARCS)),
+    "sac": TanhNormalActor(2, (8, 6), -0.5, ObservationLayout(ARCS)),
+    "td3": TanhNormalActor(2, (8,), None, ObservationLayout(ARCS)),
+    "embeddings": Actor(2, (8, 6), -0.5, ObservationLayout(ARCS, EMBEDDING_SHAPE)),
 }
 BASES = {"look ahead": LookAhead(CONFIG), "straight to goal": StraightToGoal(CONFIG), "none": None}
 TINY = """
@@ -57,7 +57,7 @@ sac:
 def policy_of(actor, base):
     """A policy of random weights, whose actions are not all at their limits."""
     rng = np.random.default_rng(0)
-    size = OBSERVATION_SIZE + math.prod(actor.senses.image or (0,))
+    size = OBSERVATION_SIZE + math.prod(actor.layout.image or (0,))
     shapes = jax.eval_shape(actor.init, jax.random.key(0), jnp.zeros(size))
 
     def drawn(leaf):
@@ -65,8 +65,8 @@ def policy_of(actor, base):
 
     mean, variance = jnp.float32(rng.uniform(size=(2, size)))
     statistics = RunningStatistics(mean, variance, jnp.float32(9))
-    learned = MeanAction(actor, jax.tree.map(drawn, shapes), statistics)
-    return Corrected(base, learned) if base else learned
+    learned = DeterministicPolicy(actor, jax.tree.map(drawn, shapes), statistics)
+    return ResidualPolicy(base, learned) if base else learned
 
 
 def observations(image=None):
@@ -110,7 +110,7 @@ def act(policy, seen):
     [(actor, "look ahead") for actor in ACTORS] + [("ppo", "straight to goal"), ("sac", "none")],
 )
 def test_all_forms_of_a_policy_agree(actor, base, tmp_path):
-    policy, seen = policy_of(ACTORS[actor], BASES[base]), observations(ACTORS[actor].senses.image)
+    policy, seen = policy_of(ACTORS[actor], BASES[base]), observations(ACTORS[actor].layout.image)
     made, in_numpy = written(policy, tmp_path)
     in_stablehlo = jax.export.deserialize(bytearray(made["policy.stablehlo"])).call
     expected = np.asarray(act(policy, seen))
@@ -212,7 +212,7 @@ def run_and_policy(tmp_path_factory):
     (run / "config.yaml").write_text(TINY)
     policies = untrained(SACTraining, run)
     config = configuration.load(SACTraining, run / "config.yaml")
-    return run, Corrected(LookAhead(config.navigation), policies[1])
+    return run, ResidualPolicy(LookAhead(config.navigation), policies[1])
 
 
 def test_a_run_is_exported_as_it_is_evaluated(run_and_policy, tmp_path, capsys):

@@ -14,9 +14,9 @@ from vertiwm_jax.networks.policy import (
     Candidates,
     Critic,
     Gaussian,
-    Senses,
-    Squashed,
-    SquashedActor,
+    ObservationLayout,
+    TanhNormal,
+    TanhNormalActor,
 )
 
 RNG = np.random.default_rng(0)
@@ -82,7 +82,7 @@ def chosen_from(order):
         return seen[..., jnp.array(order), :], observation[..., 6:]
 
     actions = ((0.0, -1.0), (0.5, 0.0), (0.0, 1.0))
-    return Senses(Candidates(split, tuple(actions[i] for i in order)))
+    return ObservationLayout(Candidates(split, tuple(actions[i] for i in order)))
 
 
 def trained(network):
@@ -135,7 +135,7 @@ def test_the_largest_of_equals_has_one_derivative_and_no_division():
 
 def test_the_picture_that_an_observation_ends_with_is_compressed():
     shape = (8, 4, 3)
-    network = Critic((8,), Senses(image=shape))
+    network = Critic((8,), ObservationLayout(image=shape))
     pixels = jax.random.normal(jax.random.key(0), (5, *shape))
     seen = jnp.concatenate([jnp.ones((5, 2)), pixels.reshape(5, -1)], axis=-1)
     params = network.init(jax.random.key(1), seen)
@@ -144,7 +144,9 @@ def test_the_picture_that_an_observation_ends_with_is_compressed():
     gradient = jax.grad(lambda x: jnp.sum(network.apply(params, x)))(seen)
     assert bool(jnp.all(gradient != 0))
     gradients = jax.grad(lambda params: jnp.sum(network.apply(params, seen)))(params)
-    assert all(bool(jnp.any(x != 0)) for x in jax.tree.leaves(gradients["params"]["Compressor_0"]))
+    assert all(
+        bool(jnp.any(x != 0)) for x in jax.tree.leaves(gradients["params"]["ImageEncoder_0"])
+    )
 
 
 def test_candidates_are_seen_before_the_picture():
@@ -169,7 +171,7 @@ def test_candidates_are_seen_before_the_picture():
 
 def test_density_of_squashed_actions_is_that_of_the_change_of_variables():
     gaussian = Gaussian(jnp.asarray(MEAN), jnp.asarray(LOG_STD))
-    action, log_prob = Squashed(gaussian).sample(jax.random.key(0))
+    action, log_prob = TanhNormal(gaussian).sample(jax.random.key(0))
     assert float(jnp.max(jnp.abs(action))) <= 1
     exact = np.clip(np.asarray(action, np.float64), -1 + 1e-6, 1 - 1e-6)
     density = scipy.stats.norm.logpdf(np.arctanh(exact), MEAN, np.exp(LOG_STD))
@@ -177,12 +179,12 @@ def test_density_of_squashed_actions_is_that_of_the_change_of_variables():
     near = np.all(np.abs(exact) < 0.999, axis=-1)
     assert near.sum() >= 2
     np.testing.assert_allclose(np.asarray(log_prob)[near], expected[near], rtol=1e-3, atol=1e-3)
-    far = Squashed(Gaussian(jnp.full(2, 50.0), jnp.zeros(2))).sample(jax.random.key(1))[1]
+    far = TanhNormal(Gaussian(jnp.full(2, 50.0), jnp.zeros(2))).sample(jax.random.key(1))[1]
     assert bool(jnp.isfinite(far))
 
 
 def test_squashed_actor_starts_near_zero_with_the_deviation_asked_for():
-    actor = SquashedActor(actions=2, hidden=(16, 16), initial_log_std=-0.9)
+    actor = TanhNormalActor(actions=2, hidden=(16, 16), initial_log_std=-0.9)
     observation = jax.random.normal(jax.random.key(1), (64, 7))
     policy = actor.apply(actor.init(jax.random.key(0), observation), observation)
     assert policy.mean.shape == (64, 2) and float(jnp.max(jnp.abs(policy.mean))) < 0.1
@@ -190,7 +192,7 @@ def test_squashed_actor_starts_near_zero_with_the_deviation_asked_for():
 
 
 def test_a_certain_actor_draws_what_it_means():
-    actor = SquashedActor(actions=2, hidden=(16,), initial_log_std=None)
+    actor = TanhNormalActor(actions=2, hidden=(16,), initial_log_std=None)
     observation = jax.random.normal(jax.random.key(1), (64, 7))
     policy = actor.apply(actor.init(jax.random.key(0), observation), observation)
     drawn = jnp.tanh(policy.gaussian.sample(jax.random.key(2)))

@@ -16,8 +16,8 @@ from rl.probes import (
     Target,
 )
 
-from vertiwm_jax.networks.policy import Senses
-from vertiwm_jax.rl.learned import Corrected
+from vertiwm_jax.networks.policy import ObservationLayout
+from vertiwm_jax.rl.learned import ResidualPolicy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 
 CONFIG = PPOConfig(
@@ -175,7 +175,7 @@ def test_a_minibatch_in_parts_gives_the_gradient_of_the_whole():
 def test_what_is_learned_from_is_what_was_seen():
     changes = {"epochs": 1, "minibatches": 1, "normalize_observations": True}
     config = PPOConfig(**{**vars(CONFIG), **changes})
-    ppo = PPO(Pictured(), config, senses=Senses(image=(4, 4, 1)))
+    ppo = PPO(Pictured(), config, layout=ObservationLayout(image=(4, 4, 1)))
     state, metrics = train(ppo, iterations=20)
     # Ratios of probabilities are 1 if the networks are told of each transition what they had seen.
     assert abs(metrics["kl"]) < 1e-6
@@ -198,6 +198,6 @@ def test_what_has_learned_nothing_leaves_a_controller_as_it_is():
     state = state.replace(params={**state.params, "actor": {"params": still}})
     learned = ppo.policy(ProbeParams(), state)
     np.testing.assert_array_equal(learned(observations), jnp.zeros((3, 1)))
-    corrected = Corrected(lambda observation, key: observation / 3, learned)
+    corrected = ResidualPolicy(lambda observation, key: observation / 3, learned)
     action = corrected(observations, jax.random.key(1))
     np.testing.assert_allclose(action, [[-1 / 3], [0.1], [1.0]], rtol=1e-6)

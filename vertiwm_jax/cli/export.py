@@ -19,7 +19,7 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.models.registry import load_encoders
 from vertiwm_jax.perception.features import Encoders
-from vertiwm_jax.rl.learned import Corrected, MeanAction
+from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy
 from vertiwm_jax.rl.policy import load_policy
 
 Record = Callable[..., bytes]
@@ -51,7 +51,7 @@ def run(name: str, words: Sequence[str]) -> None:
 
 
 def files(
-    policy: Corrected | MeanAction,
+    policy: ResidualPolicy | DeterministicPolicy,
     encoders: Encoders | None,
     config: NavigationConfig,
     vehicle: Vehicle,

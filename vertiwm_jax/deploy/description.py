@@ -14,9 +14,9 @@ from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, ObservationS
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.traversability import TraversabilityCost
 from vertiwm_jax.mechanics.vehicle import Vehicle
-from vertiwm_jax.networks.policy import SquashedActor
+from vertiwm_jax.networks.policy import TanhNormalActor
 from vertiwm_jax.rl import running_statistics
-from vertiwm_jax.rl.learned import Corrected, MeanAction
+from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy
 from vertiwm_jax.state import STEP_SECONDS, Command
 from vertiwm_jax.terrain.classes import STANDARD
 
@@ -25,7 +25,10 @@ _BASES = {LookAhead: "look ahead", StraightToGoal: REFERENCE}
 
 
 def about(
-    policy: Corrected | MeanAction, config: NavigationConfig, vehicle: Vehicle, held: int
+    policy: ResidualPolicy | DeterministicPolicy,
+    config: NavigationConfig,
+    vehicle: Vehicle,
+    held: int,
 ) -> dict[str, Any]:
     """What the numbers of a policy mean, for JSON.
 
@@ -34,8 +37,8 @@ def about(
     """
     places, heading = observation.poses_ahead(vehicle)
     still = Command(jnp.float32(0), jnp.float32(0))
-    base = policy.base if isinstance(policy, Corrected) else None
-    image = _learned(policy).actor.senses.image
+    base = policy.base if isinstance(policy, ResidualPolicy) else None
+    image = _learned(policy).actor.layout.image
     seen = ObservationSpec(image=image is not None)
     return {
         "vertiwm_jax": vertiwm_jax.__version__,
@@ -57,7 +60,7 @@ def about(
         "network": {
             "normalised_limit": running_statistics.CLIP,
             "embedding": image,
-            "squashed": isinstance(_learned(policy).actor, SquashedActor),
+            "squashed": isinstance(_learned(policy).actor, TanhNormalActor),
         },
         "base": None if base is None else {"name": _BASES[type(base)], **_numbers(base)},
         "vehicle": {name: float(getattr(vehicle, name)) for name in _SIZES},
@@ -65,7 +68,7 @@ def about(
     }
 
 
-def weights(policy: Corrected | MeanAction) -> dict[str, np.ndarray]:
+def weights(policy: ResidualPolicy | DeterministicPolicy) -> dict[str, np.ndarray]:
     """Weights of the actor, by layer, and `mean` and `std` `[O]` of observations; float32."""
     learned = _learned(policy)
     leaves = jax.tree.leaves_with_path(learned.params["params"])
@@ -75,8 +78,8 @@ def weights(policy: Corrected | MeanAction) -> dict[str, np.ndarray]:
     return {name: np.asarray(leaf, np.float32) for name, leaf in named.items()}
 
 
-def _learned(policy: Corrected | MeanAction) -> MeanAction:
-    return policy.correction if isinstance(policy, Corrected) else policy
+def _learned(policy: ResidualPolicy | DeterministicPolicy) -> DeterministicPolicy:
+    return policy.correction if isinstance(policy, ResidualPolicy) else policy
 
 
 def _part(part: Part) -> dict[str, Any]:

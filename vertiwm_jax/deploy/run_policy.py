@@ -101,7 +101,7 @@ def _learned(about: About, weights: Weights, observation: np.ndarray) -> np.ndar
 def _compressed(about: About, weights: Weights, seen: np.ndarray) -> np.ndarray:
     """Compresses the terrain embedding to `[B, 16]`: first each tile, then all tiles together."""
     rows, columns, channels = about["network"]["embedding"]
-    (kernel, bias), (together, last_bias) = _layers(weights, "Compressor_0")
+    (kernel, bias), (together, last_bias) = _layers(weights, "ImageEncoder_0")
     shape = (-1, rows * columns // 16, 16 * channels)
     tiles = np.tanh(np.reshape(_part(about, seen, "embedding"), shape) @ kernel + bias)
     return np.tanh(np.reshape(tiles, (-1, len(together))) @ together + last_bias)

@@ -20,7 +20,6 @@ from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason, edge_distance, first_ending, is_terminal
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, hmmwv, load_vehicle
 from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
-from vertiwm_jax.networks.policy import Senses
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.state import STEP_SECONDS, VehicleState
 from vertiwm_jax.terrain import obstacles, query, sensing
@@ -209,11 +208,6 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         """Every entry within the observation's limit."""
         limit, size = observation.OBSERVATION_LIMIT, self.config.observed.size
         return spaces.Box(-limit, limit, (size,), jnp.float32)
-
-    @property
-    def senses(self) -> Senses:
-        """How networks should read observations."""
-        return self.config.observed.senses
 
     @property
     def _pool(self) -> ResetPool:

@@ -15,7 +15,7 @@ from vertiwm_jax.env.route import CLEARANCE, Routes
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.env.traversability import CROWN_SCALE, SLOPE_SCALE, TWIST_SCALE, footprint, places
 from vertiwm_jax.mechanics.vehicle import Vehicle
-from vertiwm_jax.networks.policy import Candidates, Senses, tiles
+from vertiwm_jax.networks.policy import Candidates, ObservationLayout, tiles
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import obstacles, query
@@ -101,9 +101,9 @@ class ObservationSpec:
         return max(part.where.stop for part in self.parts.values())
 
     @property
-    def senses(self) -> Senses:
+    def layout(self) -> ObservationLayout:
         """How networks should read observations."""
-        return Senses(ARCS, EMBEDDING_SHAPE if self.image else None)
+        return ObservationLayout(ARCS, EMBEDDING_SHAPE if self.image else None)
 
 
 def distance_and_bearing(position: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:

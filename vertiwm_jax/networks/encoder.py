@@ -21,7 +21,7 @@ class TerrainEncoder(nn.Module):
     centimetres of relief; a branch at half the resolution adds what the neighbourhood says.
     Nothing runs at the resolution of the pixels: 1.6 MFLOP for one channel, 2.8 for three.
 
-    channels: 1 for elevation, 3 for semantic colours.
+    channels: 1 for elevation, 3 for semantic colors.
     """
 
     channels: int

@@ -42,7 +42,7 @@ class Gaussian:
 
 
 @struct.dataclass
-class Squashed:
+class TanhNormal:
     """A Gaussian over numbers whose tanh are actions (Haarnoja et al., 2018, appendix C)."""
 
     gaussian: Gaussian
@@ -61,7 +61,7 @@ class Squashed:
 
 
 class MLP(nn.Module):
-    """tanh layers of the given widths and a linear output, orthogonally initialised.
+    """tanh layers of the given widths and a linear output, orthogonally initialized.
 
     Orthogonal weights, gain sqrt(2) inside and `output_gain` at the end, are what PPO is
     known to need (Andrychowicz et al., 2021, "What matters in on-policy RL", sec. 3.2).
@@ -94,7 +94,7 @@ class Candidates:
 
 
 @dataclass(frozen=True)
-class Senses:
+class ObservationLayout:
     """How networks read an observation; by default as a plain vector.
 
     candidates: actions between which networks choose by attention.
@@ -124,7 +124,7 @@ class Senses:
         h, w, c = self.image
         rest, seen = (observation[..., part] for part in self.parts)
         seen = seen.reshape(*seen.shape[:-1], h * w // _TILE**2, _TILE**2 * c)
-        return rest, Compressor()(seen)
+        return rest, ImageEncoder()(seen)
 
 
 def tiles(picture: jax.Array) -> jax.Array:
@@ -134,7 +134,7 @@ def tiles(picture: jax.Array) -> jax.Array:
     return jnp.swapaxes(split, -4, -3).reshape(*batch, -1, _TILE**2 * c)
 
 
-class Compressor(nn.Module):
+class ImageEncoder(nn.Module):
     """Compresses the tiles of an image to 16 numbers: first each tile, then all together.
 
     It uses matmuls of tiles instead of convolutions, whose gradients would take most of an
@@ -192,11 +192,11 @@ class Actor(nn.Module):
     actions: int
     hidden: Sequence[int]
     initial_log_std: float
-    senses: Senses = Senses()
+    layout: ObservationLayout = ObservationLayout()
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> Gaussian:
-        features, attended, hidden = _look(observation, self.hidden, self.senses)
+        features, attended, hidden = _look(observation, self.hidden, self.layout)
         mean = attended + MLP(hidden, self.actions, output_gain=0.01)(features)
         low, high = LOG_STD_BOUNDS
         share = (self.initial_log_std - low) / (high - low)
@@ -209,16 +209,16 @@ class Critic(nn.Module):
     """`[..., O]` observations to `[...]` values."""
 
     hidden: Sequence[int]
-    senses: Senses = Senses()
+    layout: ObservationLayout = ObservationLayout()
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
-        features, _, hidden = _look(observation, self.hidden, self.senses)
+        features, _, hidden = _look(observation, self.hidden, self.layout)
         return MLP(hidden, 1, output_gain=1.0)(features)[..., 0]
 
 
-class SquashedActor(nn.Module):
-    """`[..., O]` observations to `Squashed` Gaussians over actions, whose width is learned too.
+class TanhNormalActor(nn.Module):
+    """`[..., O]` observations to `TanhNormal` Gaussians over actions, whose width is learned too.
 
     For off-policy algorithms. With candidates the mean corrects the mean of those attended to,
     before the tanh. Without an initial log standard deviation the policy is deterministic.
@@ -227,31 +227,31 @@ class SquashedActor(nn.Module):
     actions: int
     hidden: Sequence[int]
     initial_log_std: float | None
-    senses: Senses = Senses()
+    layout: ObservationLayout = ObservationLayout()
 
     @nn.compact
-    def __call__(self, observation: jax.Array) -> Squashed:
-        features, attended, hidden = _look(observation, self.hidden, self.senses)
+    def __call__(self, observation: jax.Array) -> TanhNormal:
+        features, attended, hidden = _look(observation, self.hidden, self.layout)
         if self.initial_log_std is None:
             mean = attended + MLP(hidden, self.actions, output_gain=0.01)(features)
-            return Squashed(Gaussian(mean, jnp.full(self.actions, -jnp.inf)))
+            return TanhNormal(Gaussian(mean, jnp.full(self.actions, -jnp.inf)))
         outputs = MLP(hidden, 2 * self.actions, output_gain=0.01)(features)
         mean, raw = jnp.split(outputs, 2, axis=-1)
         low, high = LOG_STD_BOUNDS
         share = (self.initial_log_std - low) / (high - low)
         log_std = low + (high - low) * nn.sigmoid(raw + math.log(share / (1 - share)))
-        return Squashed(Gaussian(attended + mean, log_std))
+        return TanhNormal(Gaussian(attended + mean, log_std))
 
 
 class ActionCritic(nn.Module):
     """`[..., O]` observations and `[..., A]` actions to `[...]` values."""
 
     hidden: Sequence[int]
-    senses: Senses = Senses()
+    layout: ObservationLayout = ObservationLayout()
 
     @nn.compact
     def __call__(self, observation: jax.Array, action: jax.Array) -> jax.Array:
-        features, _, hidden = _look(observation, self.hidden, self.senses)
+        features, _, hidden = _look(observation, self.hidden, self.layout)
         inputs = jnp.concatenate([features, action], axis=-1)
         return MLP(hidden, 1, output_gain=1.0)(inputs)[..., 0]
 
@@ -275,15 +275,15 @@ def _largest(x: jax.Array) -> jax.Array:
 
 
 def _look(
-    observation: jax.Array, hidden: Sequence[int], senses: Senses
+    observation: jax.Array, hidden: Sequence[int], layout: ObservationLayout
 ) -> tuple[jax.Array, jax.Array | float, Sequence[int]]:
     """Features `[..., F]`, the mean of attended actions (0 if there are none), and the layers left.
 
     Part of a module's compact method.
     """
-    observation, compressed = senses.read(observation)
-    if senses.candidates is None:
+    observation, compressed = layout.read(observation)
+    if layout.candidates is None:
         return jnp.concatenate([observation, compressed], axis=-1), 0.0, hidden
     # Apart: what is learned is learned from the one alone, and the other needs no gradient.
-    features, attended = Attention(hidden, senses.candidates)(observation, compressed)
+    features, attended = Attention(hidden, layout.candidates)(observation, compressed)
     return features, attended, hidden[-1:]

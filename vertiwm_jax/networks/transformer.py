@@ -128,7 +128,7 @@ class Transformer(nn.Module):
 
 
 class _Block(nn.Module):
-    """Attention and a SiLU MLP, each normalised before and added to what it read.
+    """Attention and a SiLU MLP, each normalized before and added to what it read.
 
     output_variance: of the weights that write to the residual, relative to the usual; less for
         more layers, so that the sum does not grow with depth (Radford et al., 2019, GPT-2).

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, TypeVar
 import optax
 
 from vertiwm_jax.config import Count, Positive, Share, settings
-from vertiwm_jax.rl.learned import MeanAction, TwinValue, Value
+from vertiwm_jax.rl.learned import DeterministicPolicy, TwinValue, Value
 from vertiwm_jax.training import Algorithm
 
 State = TypeVar("State")
@@ -71,7 +71,7 @@ class PolicyAlgorithm(Algorithm[State]):
         return self.config.num_envs
 
     @abstractmethod
-    def policy(self, data: Any, state: State) -> MeanAction:
+    def policy(self, data: Any, state: State) -> DeterministicPolicy:
         """What `state` has learned."""
 
     @abstractmethod

@@ -21,7 +21,7 @@ class Environments:
     """N running environments.
 
     state: the environment's own, leaves `[N, ...]`.
-    observation: `[N, O]` what the policy sees next, not normalised.
+    observation: `[N, O]` what the policy sees next, not normalized.
     discounted_return: `[N]` of the running episode so far.
     episode_return, episode_length: `[N]` undiscounted sum of rewards and steps so far.
     """
@@ -37,7 +37,7 @@ class Environments:
 class Steps:
     """Steps of environments, `[..., N]`.
 
-    observation: `[..., N, O]` before the step, not normalised; action: `[..., N, A]` as chosen, 1
+    observation: `[..., N, O]` before the step, not normalized; action: `[..., N, A]` as chosen, 1
         being the end of its range; terminated: what follows is worth nothing; truncated: time ran
         out; discounted_return, episode_return, episode_length: of the episodes, with this step;
         outcomes: leaves `[..., N]`, which mean something where an episode ended.

@@ -165,7 +165,7 @@ class PPOTraining(TrainConfig):
     """The algorithm."""
 
     def algorithm(self, env: NavigationEnv) -> PPO:
-        return PPO(self.repeated(env), self.ppo, outcomes, env.senses)
+        return PPO(self.repeated(env), self.ppo, outcomes, env.config.observed.layout)
 
 
 @configuration.settings
@@ -177,7 +177,7 @@ class SACTraining(TrainConfig):
     """The algorithm."""
 
     def algorithm(self, env: NavigationEnv) -> SAC:
-        return SAC(self.repeated(env), self.sac, outcomes, env.senses)
+        return SAC(self.repeated(env), self.sac, outcomes, env.config.observed.layout)
 
 
 @configuration.settings
@@ -189,7 +189,7 @@ class TD3Training(TrainConfig):
     """The algorithm."""
 
     def algorithm(self, env: NavigationEnv) -> TD3:
-        return TD3(self.repeated(env), self.td3, outcomes, env.senses)
+        return TD3(self.repeated(env), self.td3, outcomes, env.config.observed.layout)
 
 
 TRAININGS: dict[str, type[TrainConfig]] = {

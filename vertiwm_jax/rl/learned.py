@@ -12,29 +12,29 @@ from vertiwm_jax.networks.policy import (
     Actor,
     Critic,
     Gaussian,
-    Squashed,
-    SquashedActor,
+    TanhNormal,
+    TanhNormalActor,
     twin_values,
 )
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 
 
 @struct.dataclass
-class MeanAction:
+class DeterministicPolicy:
     """The learned policy as it is used: always the mean of what it would draw.
 
     actor: the network, static; params: its weights.
     observations: statistics that its observations are normalized by.
     """
 
-    actor: Actor | SquashedActor = struct.field(pytree_node=False)
+    actor: Actor | TanhNormalActor = struct.field(pytree_node=False)
     params: Any
     observations: RunningStatistics
 
     def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """`[..., O]` observations to `[..., A]` actions in [-1, 1]; the key is not used."""
         seen = self.observations.normalize(observation)
-        policy = cast(Gaussian | Squashed, self.actor.apply(self.params, seen))
+        policy = cast(Gaussian | TanhNormal, self.actor.apply(self.params, seen))
         return jnp.clip(policy.mean, -1.0, 1.0)
 
 
@@ -67,7 +67,7 @@ class TwinValue:
 
     critic: ActionCritic = struct.field(pytree_node=False)
     params: Any
-    policy: MeanAction
+    policy: DeterministicPolicy
     scale: jax.Array
 
     def __call__(self, observation: jax.Array) -> jax.Array:
@@ -78,11 +78,11 @@ class TwinValue:
 
 
 @struct.dataclass
-class Corrected:
+class ResidualPolicy:
     """A controller, static, with what was learned to correct it."""
 
     base: Controller = struct.field(pytree_node=False)
-    correction: MeanAction
+    correction: DeterministicPolicy
 
     def __call__(self, observation: jax.Array, key: jax.Array) -> jax.Array:
         """`[..., O]` observations to `[..., A]` actions in [-1, 1]."""

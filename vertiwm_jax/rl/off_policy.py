@@ -17,11 +17,16 @@ from gymnax.environments.environment import Environment
 
 from vertiwm_jax import parallel
 from vertiwm_jax.config import ConfigError, Count, NotNegative, Share, settings
-from vertiwm_jax.networks.policy import ActionCritic, Senses, SquashedActor, twin_values
+from vertiwm_jax.networks.policy import (
+    ActionCritic,
+    ObservationLayout,
+    TanhNormalActor,
+    twin_values,
+)
 from vertiwm_jax.rl import collect
 from vertiwm_jax.rl.algorithm import LearningConfig, PolicyAlgorithm
 from vertiwm_jax.rl.collect import Environments, Metrics, Outcomes, Steps
-from vertiwm_jax.rl.learned import MeanAction, TwinValue
+from vertiwm_jax.rl.learned import DeterministicPolicy, TwinValue
 from vertiwm_jax.rl.replay import Replay
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.training import all_finite
@@ -129,20 +134,20 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
 
     env: static; its parameters, `data`, are an argument of every function.
     outcomes: what to report, averaged over the episodes that end in an iteration.
-    senses: how the networks read observations.
+    layout: how the networks read observations.
     """
 
     env: Environment
     config: OffPolicyConfig
     outcomes: Outcomes = lambda info: {}
-    senses: Senses = Senses()
+    layout: ObservationLayout = ObservationLayout()
 
     @property
     def batch(self) -> int:
         return math.gcd(self.config.num_envs, self.config.batch)
 
     @abstractmethod
-    def actor(self, data: Params) -> SquashedActor:
+    def actor(self, data: Params) -> TanhNormalActor:
         """The network of the policy."""
 
     @abstractmethod
@@ -211,9 +216,9 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         }
         return replace(state, iteration=state.iteration + 1, key=key), metrics
 
-    def policy(self, data: Params, state: OffPolicyState[L]) -> MeanAction:
+    def policy(self, data: Params, state: OffPolicyState[L]) -> DeterministicPolicy:
         """What `state` has learned."""
-        return MeanAction(self.actor(data), state.learner.averaged, state.observations)
+        return DeterministicPolicy(self.actor(data), state.learner.averaged, state.observations)
 
     def value(self, data: Params, state: OffPolicyState[L]) -> TwinValue:
         """What `state` expects of its policy."""
@@ -276,7 +281,7 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
 
     @property
     def _critic(self) -> ActionCritic:
-        return ActionCritic(self.config.hidden, self.senses)
+        return ActionCritic(self.config.hidden, self.layout)
 
     def _actions(self, data: Params) -> int:
         return math.prod(self.env.action_space(data).shape)

@@ -15,15 +15,13 @@ from vertiwm_jax import atomic
 from vertiwm_jax import config as configuration
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.config import ConfigError, Count, Share
-from vertiwm_jax.env import observation
 from vertiwm_jax.env.action_repeat import Controller
 from vertiwm_jax.env.controllers import baselines
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.models.registry import ModelName
-from vertiwm_jax.networks.policy import ActionCritic, Actor, Critic, Senses, SquashedActor
-from vertiwm_jax.perception.features import EMBEDDING_SHAPE
-from vertiwm_jax.rl.learned import Corrected, MeanAction, TwinValue, Value
+from vertiwm_jax.networks.policy import ActionCritic, Actor, Critic, TanhNormalActor
+from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy, TwinValue, Value
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 
 FOLDER = "policy"
@@ -68,14 +66,14 @@ class PolicyConfig:
         return None if self.base == "none" else known[self.base]
 
     @property
-    def networks(self) -> tuple[Actor | SquashedActor, Critic | ActionCritic]:
+    def networks(self) -> tuple[Actor | TanhNormalActor, Critic | ActionCritic]:
         """Actor and critic."""
-        image = EMBEDDING_SHAPE if self.navigation.embeddings else None
-        senses, std = Senses(observation.ARCS, image), self.initial_log_std
+        layout, std = self.navigation.observed.layout, self.initial_log_std
         if self.algorithm == "ppo":
             assert std is not None
-            return Actor(_ACTIONS, self.hidden, std, senses), Critic(self.hidden, senses)
-        return SquashedActor(_ACTIONS, self.hidden, std, senses), ActionCritic(self.hidden, senses)
+            return Actor(_ACTIONS, self.hidden, std, layout), Critic(self.hidden, layout)
+        actor = TanhNormalActor(_ACTIONS, self.hidden, std, layout)
+        return actor, ActionCritic(self.hidden, layout)
 
 
 @struct.dataclass
@@ -86,7 +84,7 @@ class Policy:
     base: the controller that it corrects; config: of its folder.
     """
 
-    learned: MeanAction
+    learned: DeterministicPolicy
     worth: Value | TwinValue
     base: Controller | None = struct.field(pytree_node=False)
     config: PolicyConfig = struct.field(pytree_node=False)
@@ -97,9 +95,9 @@ class Policy:
         return self.config.navigation
 
     @property
-    def acting(self) -> Corrected | MeanAction:
+    def acting(self) -> ResidualPolicy | DeterministicPolicy:
         """What drives: the controller as corrected, or the actor alone."""
-        return self.learned if self.base is None else Corrected(self.base, self.learned)
+        return self.learned if self.base is None else ResidualPolicy(self.base, self.learned)
 
     def on(self, vehicle: VehicleConfig) -> Self:
         """The same policy with a controller of another vehicle."""
@@ -115,7 +113,9 @@ class Policy:
         return self.worth(observation)
 
 
-def save(folder: Path, config: PolicyConfig, policy: MeanAction, value: Value | TwinValue) -> None:
+def save(
+    folder: Path, config: PolicyConfig, policy: DeterministicPolicy, value: Value | TwinValue
+) -> None:
     """Writes the folder of a policy; leaves have a leading axis of seeds.
 
     `WriteError` where that is not possible.
@@ -168,7 +168,9 @@ def load_policy(folder: str | Path, seed: int = 0) -> Policy:
     observations = RunningStatistics(
         *(arrays[f"observation_{name}"] for name in ("mean", "variance", "count"))
     )
-    learned = MeanAction(actor, _weights(file, "actor", arrays, actor.init, seen), observations)
+    learned = DeterministicPolicy(
+        actor, _weights(file, "actor", arrays, actor.init, seen), observations
+    )
     scale = arrays["return_scale"]
     if isinstance(critic, ActionCritic):
         twins = jax.vmap(critic.init, (0, None, None))

@@ -19,13 +19,13 @@ from jax.sharding import PartitionSpec
 
 from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, NotNegative, Positive, Share, settings
-from vertiwm_jax.networks.policy import Actor, Critic, Gaussian, Senses
+from vertiwm_jax.networks.policy import Actor, Critic, Gaussian, ObservationLayout
 from vertiwm_jax.parallel import BATCH, ROWS, WHOLE
 from vertiwm_jax.rl import collect
 from vertiwm_jax.rl.algorithm import LearningConfig, PolicyAlgorithm
 from vertiwm_jax.rl.collect import Environments, Metrics, Outcomes, Steps
 from vertiwm_jax.rl.gae import gae
-from vertiwm_jax.rl.learned import MeanAction, Value
+from vertiwm_jax.rl.learned import DeterministicPolicy, Value
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.training import all_finite, mean_in_turns
 
@@ -55,7 +55,7 @@ class PPOConfig(LearningConfig):
     grad_accumulation: Count = 1
     """Parts of a minibatch whose gradients are computed one after the other, for less memory."""
     gae_lambda: Share = 0.95
-    """Lambda of the generalised advantage estimator."""
+    """Lambda of the generalized advantage estimator."""
     clip_eps: Positive = 0.2
     """Largest change of the probability ratio that is rewarded."""
     value_clip: float | None = None
@@ -160,7 +160,7 @@ class PPO(PolicyAlgorithm[TrainState]):
 
     env: static; its parameters are an argument of every function.
     outcomes: what to report, averaged over the episodes that end in an iteration.
-    senses: how the networks read observations.
+    layout: how the networks read observations.
     """
 
     specs: ClassVar[Any] = _STATE
@@ -168,7 +168,7 @@ class PPO(PolicyAlgorithm[TrainState]):
     env: Environment
     config: PPOConfig
     outcomes: Outcomes = lambda info: {}
-    senses: Senses = Senses()
+    layout: ObservationLayout = ObservationLayout()
 
     def init(self, data: Params, key: jax.Array) -> TrainState:
         """The state before the first iteration."""
@@ -202,10 +202,10 @@ class PPO(PolicyAlgorithm[TrainState]):
         )
         return on_device(data, replace(state, key=key), draws)
 
-    def policy(self, data: Params, state: TrainState) -> MeanAction:
+    def policy(self, data: Params, state: TrainState) -> DeterministicPolicy:
         """What `state` has learned."""
         actor, params = self._actor(data), state.params["actor"]
-        return MeanAction(actor, params, state.observations)
+        return DeterministicPolicy(actor, params, state.observations)
 
     def value(self, data: Params, state: TrainState) -> Value:
         """What `state` expects of its policy."""
@@ -216,11 +216,11 @@ class PPO(PolicyAlgorithm[TrainState]):
     def _actor(self, data: Params) -> Actor:
         actions = math.prod(self.env.action_space(data).shape)
         config = self.config
-        return Actor(actions, config.hidden, config.initial_log_std, self.senses)
+        return Actor(actions, config.hidden, config.initial_log_std, self.layout)
 
     @property
     def _critic(self) -> Critic:
-        return Critic(self.config.hidden, self.senses)
+        return Critic(self.config.hidden, self.layout)
 
     @property
     def _optimizer(self) -> optax.GradientTransformation:
@@ -369,7 +369,7 @@ class PPO(PolicyAlgorithm[TrainState]):
         # of observations take long to write.
         parts = [
             state.observations.of(part).normalize(take(batch.observation, rows, part))
-            for part in self.senses.parts
+            for part in self.layout.parts
         ]
         return jnp.concatenate(parts, axis=-1)
 

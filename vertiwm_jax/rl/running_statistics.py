@@ -1,4 +1,4 @@
-"""Running mean and variance, and the normalisation made from them."""
+"""Running mean and variance, and the normalization made from them."""
 
 import dataclasses
 import math

@@ -13,7 +13,7 @@ import optax
 from flax import struct
 
 from vertiwm_jax.config import Positive, settings
-from vertiwm_jax.networks.policy import Squashed, SquashedActor
+from vertiwm_jax.networks.policy import TanhNormal, TanhNormalActor
 from vertiwm_jax.rl.collect import Metrics
 from vertiwm_jax.rl.off_policy import Learner, OffPolicy, OffPolicyConfig, Params, Remembered
 
@@ -44,10 +44,10 @@ class SAC(OffPolicy[SACLearner]):
 
     config: SACConfig
 
-    def actor(self, data: Params) -> SquashedActor:
+    def actor(self, data: Params) -> TanhNormalActor:
         config = self.config
-        return SquashedActor(
-            self._actions(data), config.hidden, config.initial_log_std, self.senses
+        return TanhNormalActor(
+            self._actions(data), config.hidden, config.initial_log_std, self.layout
         )
 
     def init_learner(self, data: Params, observation: jax.Array, key: jax.Array) -> SACLearner:
@@ -106,5 +106,5 @@ class SAC(OffPolicy[SACLearner]):
         }
         return learner, metrics
 
-    def _policy(self, data: Params, actor: Params, observation: jax.Array) -> Squashed:
-        return cast(Squashed, self.actor(data).apply(actor, observation))
+    def _policy(self, data: Params, actor: Params, observation: jax.Array) -> TanhNormal:
+        return cast(TanhNormal, self.actor(data).apply(actor, observation))

@@ -9,7 +9,7 @@ import optax
 from flax import struct
 
 from vertiwm_jax.config import Count, NotNegative, settings
-from vertiwm_jax.networks.policy import Squashed, SquashedActor
+from vertiwm_jax.networks.policy import TanhNormal, TanhNormalActor
 from vertiwm_jax.rl.collect import Metrics
 from vertiwm_jax.rl.off_policy import Learner, OffPolicy, OffPolicyConfig, Params, Remembered
 
@@ -47,8 +47,8 @@ class TD3(OffPolicy[TD3Learner]):
 
     config: TD3Config
 
-    def actor(self, data: Params) -> SquashedActor:
-        return SquashedActor(self._actions(data), self.config.hidden, None, self.senses)
+    def actor(self, data: Params) -> TanhNormalActor:
+        return TanhNormalActor(self._actions(data), self.config.hidden, None, self.layout)
 
     def init_learner(self, data: Params, observation: jax.Array, key: jax.Array) -> TD3Learner:
         return TD3Learner(**self.init_weights(data, observation, key), update=jnp.int32(0))
@@ -101,4 +101,4 @@ class TD3(OffPolicy[TD3Learner]):
         ), loss
 
     def _action(self, data: Params, actor: Params, observation: jax.Array) -> jax.Array:
-        return cast(Squashed, self.actor(data).apply(actor, observation)).mean
+        return cast(TanhNormal, self.actor(data).apply(actor, observation)).mean
