@@ -15,8 +15,7 @@ from flax import struct
 
 from vertiwm_jax import atomic
 from vertiwm_jax import config as configuration
-from vertiwm_jax.cli import export
-from vertiwm_jax.deploy import onnx_graph, run_policy, stablehlo
+from vertiwm_jax.deploy import export, onnx_graph, run_policy, stablehlo
 from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.controllers import LookAhead, StraightToGoal
 from vertiwm_jax.env.episodes import run_episodes

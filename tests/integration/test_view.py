@@ -69,7 +69,7 @@ def test_maps_are_drawn_beside_them(tmp_path, capsys):
 def test_another_vehicle_is_shown_as_large_as_it_is(uniform, tmp_path):
     path = recordings.write(tmp_path)
     for name, wheelbase in ((None, 3.302), ("rover", 3.12)):
-        scene = view._recorded(view.View(path, vehicle=name))
+        scene = view._scene(view.View(path, vehicle=name))
         np.testing.assert_allclose(scene.vehicle.wheelbase, wheelbase, rtol=1e-5)
     assert "did you mean 'rover'" in refusal(door("view"), path, "--vehicle", "rovr")
 
@@ -101,11 +101,12 @@ def test_without_rerun(tmp_path, monkeypatch):
 
 def test_what_cannot_be_shown_is_named(uniform, tmp_path, capsys):
     path = recordings.write(tmp_path)
+    (tmp_path / "empty").mkdir()
     before = {path.name for path in tmp_path.iterdir()}
     assert "a.npz: suite: is of a policy" in refusal(door("view"), path, "--suite", "easy")
     assert "drive: expected 0 to 24, found 99" in refusal(door("view"), path, "--drive", 99)
     assert "none.npz: " in refusal(door("view"), tmp_path / "none.npz")
-    assert "maps/config.yaml: no such file" in refusal(door("view"), tmp_path / "maps")
+    assert "empty/config.yaml: no such file" in refusal(door("view"), tmp_path / "empty")
     nowhere = tmp_path / "none" / "a.rrd"
     assert "none/a.rrd: cannot write" in refusal(door("view"), path, "--output", nowhere)
     assert {path.name for path in tmp_path.iterdir()} == before

@@ -1,28 +1,13 @@
 """`vertiwm export`: a learned policy as robots can run it."""
 
-import io
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-import jax
-import numpy as np
 import tyro
 
-from vertiwm_jax import atomic
 from vertiwm_jax.cli import arguments
-from vertiwm_jax.config import ConfigError
-from vertiwm_jax.deploy import description, run_policy, stablehlo
-from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.mechanics.vehicle import Vehicle
-from vertiwm_jax.models.registry import load_encoders
-from vertiwm_jax.perception.features import Encoders
-from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy
-from vertiwm_jax.rl.policy import load_policy
-
-Record = Callable[..., bytes]
+from vertiwm_jax.deploy.export import export
 
 
 @dataclass(frozen=True)
@@ -40,51 +25,5 @@ class Export:
 def run(name: str, words: Sequence[str]) -> None:
     command = arguments.read(Export, name, words)
     folder = command.output or command.run / "export"
-    record, policy = _recorder(), load_policy(command.run, command.seed)
-    config = policy.config
-    seen_by = load_encoders(config.weights) if policy.task.embeddings else None
-    told = policy.task, config.vehicle.vehicle, config.action_repeat
-    with atomic.new_folder(folder) as unfinished:
-        for file, data in files(policy.acting, seen_by, *told, record).items():
-            atomic.write(unfinished / file, data)
+    export(command.run, folder, command.seed)
     print(f"the policy is in {folder}")
-
-
-def files(
-    policy: ResidualPolicy | DeterministicPolicy,
-    encoders: Encoders | None,
-    config: NavigationConfig,
-    vehicle: Vehicle,
-    held: int,
-    record: Record,
-) -> dict[str, bytes | str]:
-    """What the folder of a policy holds, by name.
-
-    encoders: of a policy that sees embeddings; config, vehicle, held: as in `description.about`;
-    record: `onnx_graph.record`.
-    """
-    about, weights = description.about(policy, config, vehicle, held), description.weights(policy)
-    arrays = io.BytesIO()
-    np.savez(arrays, allow_pickle=False, **weights)
-    size = about["observation"]["size"]
-    return {
-        "policy.json": json.dumps(about, indent=1) + "\n",
-        "policy.npz": arrays.getvalue(),
-        "policy.onnx": record(partial(run_policy.act, about, weights), size, 2),
-        # The key is not used: no learned policy is random.
-        "policy.stablehlo": stablehlo.policy(lambda seen: policy(seen, jax.random.key(0)), size),
-        "route.stablehlo": stablehlo.route(config, vehicle),
-        "observe.stablehlo": stablehlo.observe(config, vehicle, encoders),
-        "run_policy.py": Path(run_policy.__file__).read_bytes(),
-    }
-
-
-def _recorder() -> Record:
-    try:
-        from vertiwm_jax.deploy.onnx_graph import record
-    except ImportError as error:
-        raise ConfigError(
-            f"policy.onnx: expected the package onnx to write it, found: {error}; "
-            'pip install "vertiwm-jax[export]"'
-        ) from None
-    return record

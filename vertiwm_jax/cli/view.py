@@ -2,26 +2,20 @@
 
 import subprocess
 import sys
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import jax
 import tyro
 
-from vertiwm_jax import figures
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import ConfigError, CountOrZero, settings
-from vertiwm_jax.env import suites
 from vertiwm_jax.env.suites import Suite
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.models.registry import ModelName, load_model
-from vertiwm_jax.rl import experiment
-from vertiwm_jax.terrain.files import load_map
-from vertiwm_jax.viewing import driven, movie, recorded
+from vertiwm_jax.viewing import driven, maps, movie, recorded
 from vertiwm_jax.viewing.scene import Scene
 
 
@@ -63,10 +57,14 @@ class View:
 
 def run(name: str, words: Sequence[str]) -> None:
     command = arguments.read(View, name, words)
-    if _are_maps(command.source):
-        print(f"the picture is {_picture(command)}")
+    if maps.are_maps(command.source):
+        print(f"the picture is {maps.draw(command.source, command.output)}")
         return
-    path = view(command)
+    path = command.movie or command.output or _beside(command)
+    write = _writer(command, path)
+    scene = _scene(command)
+    print(scene.title, flush=True)
+    write(scene, path)
     if command.movie:
         print(f"the movie is {path}")
         return
@@ -77,37 +75,13 @@ def run(name: str, words: Sequence[str]) -> None:
             raise UserError(f"{path}: the rerun viewer ended with status {status}")
 
 
-def _are_maps(source: Path) -> bool:
-    """Whether it is a map, or a folder of maps, and not a run or a file of drives."""
-    if source.is_dir():
-        files = [*source.glob("*.npz"), *source.glob("envs")]
-        return bool(files) and not (source / "config.yaml").exists()
-    if not zipfile.is_zipfile(source):
-        return False
-    with zipfile.ZipFile(source) as file:
-        return "elevation.npy" in file.namelist() and "state.npy" not in file.namelist()
-
-
-def _picture(command: View) -> Path:
-    """Draws the maps from above; the file."""
+def _beside(command: View) -> Path:
+    """Where a recording is, unless another file was asked for."""
     source = command.source
-    path = command.output or (
-        source / "maps.png" if source.is_dir() else source.with_suffix(".png")
-    )
-    files = sorted(source.glob("*.npz")) if source.is_dir() else [source]
-    figures.save(load_map(source).plot([file.stem for file in files] or None), path)
-    return path
-
-
-def view(command: View) -> Path:
-    """Writes what was asked for, as a whole or not at all; the file."""
-    of_run = command.source.is_dir()
-    path = command.movie or command.output or (_beside_run if of_run else _beside_file)(command)
-    write = _writer(command, path)
-    scene = (_driven if of_run else _recorded)(command)
-    print(scene.title, flush=True)
-    write(scene, path)
-    return path
+    if source.is_dir():
+        task = f"{command.suite or 'held-out'}-{command.task or 0}"
+        return source / f"{task}-{command.model}.rrd"
+    return source.with_name(f"{source.stem}-drive-{command.drive or 0}.rrd")
 
 
 def _writer(command: View, path: Path) -> Callable[[Scene, Path], None]:
@@ -125,50 +99,19 @@ def _writer(command: View, path: Path) -> Callable[[Scene, Path], None]:
     return write
 
 
-def _beside_run(command: View) -> Path:
-    task = f"{command.suite or 'held-out'}-{command.task or 0}"
-    return command.source / f"{task}-{command.model}.rrd"
-
-
-def _beside_file(command: View) -> Path:
-    return command.source.with_name(f"{command.source.stem}-drive-{command.drive or 0}.rrd")
-
-
-def _driven(command: View) -> Scene:
-    """The policy of a run on its experiment."""
-    run, number, seed = command.source, command.task or 0, command.seed or 0
-    if command.drive is not None:
-        raise ConfigError(f"{run}: drive: is of a file of drives, found the folder of a run")
-    config = replace(experiment.load(run / "config.yaml"), planning=None)
-    if command.suite:
-        config = replace(config, worlds=None)
-        config = replace(config, ground=replace(config.ground, suites=(command.suite,)))
-    if command.weights:
-        config = replace(config, weights=command.weights)
-    if command.vehicle is not None:
-        config = replace(config, vehicle=command.vehicle)
-    terrain = experiment.held_out(config)
-    policies = experiment.learned(config, run)
-    pool = suites.test_tasks(config.ground, terrain)
-    for name, found, count in (("task", number, len(pool.world)), ("seed", seed, len(policies))):
-        if not 0 <= found < count:
-            raise ConfigError(f"{run}: {name}: expected 0 to {count - 1}, found {found}")
-    alone = jax.tree.map(lambda x: x[number : number + 1], pool)
-    test = experiment.environment(config, command.model, terrain, alone)
-    name, policy = list(policies.items())[seed]
-    title = f"{name} in {command.model}"
-    scene = driven.drive(test.env, test.params, policy, config.key("testing"), title)
-    return replace(scene, vehicle=config.driven.vehicle)
-
-
-def _recorded(command: View) -> Scene:
-    """The drive of a file beside a model's predictions."""
-    file, number = command.source, command.drive or 0
+def _scene(command: View) -> Scene:
+    """A policy's drive, or a recorded one."""
+    source = command.source
+    if source.is_dir():
+        if command.drive is not None:
+            raise ConfigError(f"{source}: drive: is of a file of drives, found the folder of a run")
+        which = command.suite, command.task or 0, command.seed or 0
+        return driven.load(source, command.model, command.weights, command.vehicle, *which)
     for name in ("suite", "task", "seed"):
         if getattr(command, name) is not None:
             raise ConfigError(
-                f"{file}: {name}: is of a policy, expected the folder of a run, found none"
+                f"{source}: {name}: is of a policy, expected the folder of a run, found none"
             )
     shown = vehicle.load(command.vehicle or HMMWV).vehicle
     model = load_model(command.model, command.weights, vehicle=shown)
-    return replace(recorded.load(file, number, command.model, *model), vehicle=shown)
+    return replace(recorded.load(source, command.drive or 0, command.model, *model), vehicle=shown)

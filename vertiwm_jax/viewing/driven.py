@@ -1,16 +1,69 @@
 """A policy's drive through one task as a scene."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import jax
 import numpy as np
 
+from vertiwm_jax.config import ConfigError
+from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.suites import Suite
 from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation.prediction import modelled
+from vertiwm_jax.models.registry import ModelName
+from vertiwm_jax.rl import experiment
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.viewing.scene import Scene
+
+
+def load(
+    run: Path,
+    model: ModelName = "vertiwm",
+    weights: Path | None = None,
+    vehicle: str | None = None,
+    suite: Suite | None = None,
+    task: int = 0,
+    seed: int = 0,
+) -> Scene:
+    """The policy of a run on a task that was held out of its training.
+
+    Args:
+        run: the folder of the training.
+        model: what the policy drives in.
+        weights: folder of a fitted model, instead of the run's.
+        vehicle: name or YAML file of a vehicle, instead of the run's.
+        suite: kind of procedural worlds, instead of those held out.
+        task: which of the tasks there.
+        seed: which of the policies that the run trained side by side.
+
+    Raises:
+        ConfigError: there is no such task or policy.
+    """
+    config = replace(experiment.load(run / "config.yaml"), planning=None)
+    if suite:
+        config = replace(config, worlds=None)
+        config = replace(config, ground=replace(config.ground, suites=(suite,)))
+    if weights:
+        config = replace(config, weights=weights)
+    if vehicle is not None:
+        config = replace(config, vehicle=vehicle)
+    terrain = experiment.held_out(config)
+    policies = experiment.learned(config, run)
+    pool = suites.test_tasks(config.ground, terrain)
+    for name, found, count in (("task", task, len(pool.world)), ("seed", seed, len(policies))):
+        if not 0 <= found < count:
+            raise ConfigError(f"{run}: {name}: expected 0 to {count - 1}, found {found}")
+    alone = jax.tree.map(lambda x: x[task : task + 1], pool)
+    test = experiment.environment(config, model, terrain, alone)
+    name, policy = list(policies.items())[seed]
+    title = f"{name} in {model}"
+    scene = drive(test.env, test.params, policy, config.key("testing"), title)
+    return replace(scene, vehicle=config.driven.vehicle)
 
 
 def drive(

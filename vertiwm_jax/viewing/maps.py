@@ -1,0 +1,26 @@
+"""Maps from above, as a picture."""
+
+import zipfile
+from pathlib import Path
+
+from vertiwm_jax import figures
+from vertiwm_jax.terrain.files import load_map
+
+
+def are_maps(source: Path) -> bool:
+    """Whether it is a map, or a folder of maps, and not a run or a file of drives."""
+    if source.is_dir():
+        files = [*source.glob("*.npz"), *source.glob("envs")]
+        return bool(files) and not (source / "config.yaml").exists()
+    if not zipfile.is_zipfile(source):
+        return False
+    with zipfile.ZipFile(source) as file:
+        return "elevation.npy" in file.namelist() and "state.npy" not in file.namelist()
+
+
+def draw(source: Path, path: Path | None = None) -> Path:
+    """Draws a map, or all maps of a folder; the file, which is beside them by default."""
+    path = path or (source / "maps.png" if source.is_dir() else source.with_suffix(".png"))
+    files = sorted(source.glob("*.npz")) if source.is_dir() else [source]
+    figures.save(load_map(source).plot([file.stem for file in files] or None), path)
+    return path
