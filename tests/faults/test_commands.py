@@ -74,7 +74,7 @@ def test_an_unwritable_output_is_refused_first(tmp_path, monkeypatch, command):
     recordings.write(tmp_path, **recordings.drives())
     for place, name in (
         (evaluate.external, "test_in"),
-        (evaluate.prediction, "evaluate"),
+        (evaluate.prediction, "predict"),
         (evaluate.calibration, "signs"),
     ):
         monkeypatch.setattr(place, name, begin)

@@ -91,8 +91,7 @@ def test_the_same_drive_at_four_times_the_size_takes_twice_as_long():
         state = VehicleState(*start, jnp.zeros(3), jnp.zeros(3))
         steering = jnp.repeat(0.3 * jnp.sin(0.1 * jnp.arange(30)), held)
         command = Command(jnp.full(30 * held, 1.0 * scale**0.5), steering)
-        history = model.init(params, ground, state)
-        return jax.jit(rollout, static_argnums=0)(model, params, ground, history, state, command)
+        return jax.jit(rollout, static_argnums=0)(model, params, ground, state, command)
 
     small, large = driven(1.0, 1, 20), driven(4.0, 2, 10)
     travelled = np.linalg.norm(small.position[-1, :2])

@@ -196,9 +196,9 @@ def test_it_is_what_encoders_make_of_the_patches_at_the_pose():
 def test_the_first_layer_of_the_network_alone_learns_and_only_from_latents():
     def total(pairs, state, latents):
         seen = reduced(pairs, perceive(pairs, world(), state, latents=latents))
-        return sum(jnp.sum(x.reduced**2) + jnp.sum(x.average) for x in seen)
+        return jnp.sum(seen[0].reduced ** 2) + sum(jnp.sum(x.average) for x in seen)
 
-    pairs, state = (FIRST, FIRST), places()
+    pairs, state = (FIRST, SECOND), places()
     first, second = jax.grad(total)(pairs, state, True)
     assert all(np.any(leaf) for leaf in jax.tree.leaves(first.reduce))
     rest = replace(first, reduce=None), second

@@ -153,4 +153,5 @@ def place(
         jnp.float32(sizes.track),
         jnp.float32(sizes.ride_height),
     )
-    return VehicleState(position, rpy, jnp.array([speed, 0.0, 0.0]), jnp.zeros(3))
+    velocity = jnp.zeros(3).at[0].set(speed)
+    return VehicleState(position, rpy, velocity, jnp.zeros(3))
