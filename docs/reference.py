@@ -17,9 +17,9 @@ from mkdocs.structure.files import File, Files
 
 import vertiwm_jax
 from vertiwm_jax import config as configuration_files
-from vertiwm_jax.cli.compare import CompareConfig
 from vertiwm_jax.cli.make_logs import MakeLogs
 from vertiwm_jax.config import default_config
+from vertiwm_jax.evaluation.compare import CompareConfig
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.mechanics.vehicle import VehicleConfig

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from vertiwm_jax import config
-from vertiwm_jax.cli.compare import CompareConfig
+from vertiwm_jax.evaluation.compare import CompareConfig
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.mechanics.vehicle import VehicleConfig

@@ -8,8 +8,8 @@ from doors import door, opened, refusal
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import machine, runs
-from vertiwm_jax.cli import compare
-from vertiwm_jax.cli.compare import CompareConfig, Row
+from vertiwm_jax.evaluation import compare
+from vertiwm_jax.evaluation.compare import CompareConfig, Row
 
 SHARED = """
 ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 1}
