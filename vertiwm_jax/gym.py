@@ -1,24 +1,33 @@
 """The task by its name: importing this module registers it with Gymnasium and with gymnax.
 
-import gymnasium, vertiwm_jax.gym
+import gymnasium, gymnax, vertiwm_jax.gym
 
 env = gymnasium.make("vertiwm_jax/OffRoadNavigation-v0", terrain="MAPS", model="builtin")
 envs = gymnasium.make_vec("vertiwm_jax/OffRoadNavigation-v0", num_envs=64)
+env, env_params = gymnax.make("OffRoadNavigation-v0", model="nesam")
 """
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import gymnasium
+import gymnax
+import jax
 
 from vertiwm_jax.env.gymnasium import NavigationGymEnv, NavigationVectorEnv
-from vertiwm_jax.env.gymnax import NAME as _GYMNAX_NAME
 from vertiwm_jax.env.navigation import NavigationEnv, make_env
-from vertiwm_jax.env.task import TaskParams
+from vertiwm_jax.env.task import NavigationConfig, TaskParams
+from vertiwm_jax.env.tasks import random_tasks
+from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.models.registry import ModelName, load_encoders, load_model
+from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.files import load_map
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.worlds import WorldConfig
 
-NAME = f"vertiwm_jax/{_GYMNAX_NAME}"
+GYMNAX_NAME = "OffRoadNavigation-v0"
+NAME = f"vertiwm_jax/{GYMNAX_NAME}"
 
 
 def make(
@@ -56,4 +65,42 @@ def _task(
     return make_env(terrain, model, **settings)
 
 
+@dataclass(frozen=True)
+class ProceduralNavigation(NavigationEnv):
+    """Goal navigation on procedural worlds, which are its default parameters; for `gymnax.make`.
+
+    To choose maps, tasks or weights yourself, use `make_env`.
+
+    relief: what the worlds are like. number: of worlds; starts: of random tasks on all of them.
+    model: what moves the vehicle, of which `dynamics` is the object. seed: draws worlds and tasks.
+    """
+
+    model: ModelName = "builtin"
+    relief: WorldConfig = WorldConfig()
+    number: int = 8
+    starts: int = 256
+    seed: int = 0
+
+    @classmethod
+    def of(
+        cls,
+        model: ModelName = "builtin",
+        config: NavigationConfig = NavigationConfig(),
+        **settings,
+    ) -> Self:
+        """The environment in a model of `load_model`, with any of the other settings."""
+        dynamics, _ = load_model(model, embeddings=config.embeddings)
+        return cls(dynamics, config, model=model, **settings)
+
+    @property
+    def default_params(self) -> TaskParams:
+        """Drawn and settled anew whenever asked for, in seconds: keep them, and pass them on."""
+        world_key, task_key = jax.random.split(jax.random.key(self.seed))
+        terrain = worlds.generate(jax.random.split(world_key, self.number), self.relief)
+        tasks = random_tasks(task_key, terrain, self.starts, hmmwv())
+        encoders = load_encoders() if self.config.embeddings else None
+        return self.make_params(load_model(self.model)[1], terrain, tasks, encoders=encoders)
+
+
 gymnasium.register(NAME, make, vector_entry_point=make_vec)
+gymnax.register(GYMNAX_NAME, ProceduralNavigation.of)

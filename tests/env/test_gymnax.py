@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from vertiwm_jax.checkpoints import CheckpointError
-from vertiwm_jax.env.gymnax import NAME
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
+from vertiwm_jax.gym import GYMNAX_NAME
 from vertiwm_jax.terrain.worlds import WorldConfig
 
 STEPS = 6
@@ -17,11 +17,11 @@ STEPS = 6
 def made():
     """Episodes of 3 steps on two level worlds."""
     settings = {"relief": WorldConfig(("low",)), "number": 2, "starts": 5, "seed": 3}
-    return gymnax.make(NAME, config=NavigationConfig(horizon_seconds=0.3), **settings)
+    return gymnax.make(GYMNAX_NAME, config=NavigationConfig(horizon_seconds=0.3), **settings)
 
 
 def test_it_is_made_by_name():
-    assert NAME in gymnax.registered_envs
+    assert GYMNAX_NAME in gymnax.registered_envs
 
 
 def test_random_rollouts_in_gymnax_s_own_way(made):
@@ -59,11 +59,11 @@ def test_settings_decide_worlds_and_tasks(made):
     again = env.default_params
     np.testing.assert_array_equal(again.starts.goal, env_params.starts.goal)
     np.testing.assert_array_equal(again.terrain.elevation, env_params.terrain.elevation)
-    other, params = gymnax.make(NAME, number=1, starts=2, relief=WorldConfig(("low",)))
+    other, params = gymnax.make(GYMNAX_NAME, number=1, starts=2, relief=WorldConfig(("low",)))
     assert other != env and params.terrain.worlds == 1
     assert not jnp.array_equal(params.terrain.elevation[0], env_params.terrain.elevation[0])
 
 
 def test_a_model_that_does_not_exist_is_refused():
     with pytest.raises(CheckpointError, match="expected unicycle, found"):
-        gymnax.make(NAME, model="unicycle")
+        gymnax.make(GYMNAX_NAME, model="unicycle")

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from env.worlds import GRASS, bicycle_env, ground
 
-import vertiwm_jax.env.gymnax  # Registers the task.
+import vertiwm_jax.gym  # Registers the task.
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, rollout
 from vertiwm_jax.env.navigation import NavigationEnv
@@ -68,7 +68,7 @@ CASES = {
     "bicycle": lambda: drive(KinematicBicycle(), bicycle_of(hmmwv())),
     "simulator": lambda: drive(Simulator(), chrono_like(hmmwv())),
     "shipped weights": lambda: drive(*load_model("vertiwm")),
-    "gymnax": lambda: gymnax.make(vertiwm_jax.env.gymnax.NAME, model="builtin", number=1, starts=4)[
+    "gymnax": lambda: gymnax.make(vertiwm_jax.gym.GYMNAX_NAME, model="builtin", number=1, starts=4)[
         1
     ],
     "ppo": lambda: learn(lambda env: PPO(env, PPOConfig(**COLLECTED, minibatches=2, epochs=1))),
