@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 
 from vertiwm_jax.adaptation.soil_filter import SoilFilter
 from vertiwm_jax.evaluation import adaptation
-from vertiwm_jax.learning.dataset import Auxiliary, Drives
+from vertiwm_jax.learning.dataset import Drives, WheelSignals
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import GRAVITY, hmmwv
 from vertiwm_jax.mechanics.wheel import Wheel
@@ -43,7 +43,7 @@ def driven() -> Drives:
     control = np.tile(np.float32([2.0, 0.0]), (2, STEPS, 1))
     kinds = np.full((2, STEPS + 1, 4), MUD, np.uint8)
     length, world = np.array([STEPS, 50], np.int32), np.zeros(2, np.int32)
-    return Drives(state, control, length, kinds, world, Auxiliary())
+    return Drives(state, control, length, kinds, world, WheelSignals())
 
 
 def test_predictions_get_better_as_the_drive_goes_on():

@@ -177,7 +177,7 @@ def test_error_is_found_where_it_is():
     x = jnp.array([-20.0, -3.0, 0.5, 20.0])
     windows = windows.replace(state=windows.state.at[..., 0].add(x[:, None]))
     chassis = jnp.zeros((4, CONTEXT + HORIZON + 1, 3)).at[3, -1, 2].set(100.0)
-    windows = windows.replace(auxiliary=windows.auxiliary.replace(chassis_force=chassis))
+    windows = windows.replace(wheels=windows.wheels.replace(chassis_force=chassis))
     start = np.asarray(windows.state[:, CONTEXT, 0])
     shares = error_sources.locate(
         TestWindows(windows, np.arange(4), terrain), np.array([1.0, 2.0, 3.0, 4.0])

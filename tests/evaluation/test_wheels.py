@@ -10,7 +10,7 @@ import pytest
 from vertiwm_jax.evaluation import prediction, wheels
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity
 from vertiwm_jax.models.config import ModelConfig, with_soil
 from vertiwm_jax.models.registry import load_model
@@ -48,7 +48,7 @@ def test_wheels_of_the_simulator_go_with_those_recorded(test, simulated):
         "sinkage, mm", "speed, rad/s", "force, kN",
     )  # fmt: skip
     assert all(x.ground == "deformable" for x in simulated)
-    depth = 1000 * np.maximum(test.windows.auxiliary.wheel_sinkage[:, -1], 0)
+    depth = 1000 * np.maximum(test.windows.wheels.wheel_sinkage[:, -1], 0)
     assert sinkage.recorded == pytest.approx(depth.mean(), rel=1e-4)
     assert all(x.error < 0.6 * x.recorded and x.correlation > 0.7 for x in simulated)
     assert 4 < force.recorded < 9  # A quarter of the vehicle's weight, about.
@@ -74,8 +74,8 @@ def test_every_model_with_physics_tells_of_its_wheels_and_others_do_not(test, si
 
 
 def test_what_was_not_recorded_is_not_compared(test, simulated):
-    speed = test.windows.auxiliary.wheel_omega
-    some = replace(test, windows=test.windows.replace(auxiliary=Auxiliary(wheel_omega=speed)))
+    speed = test.windows.wheels.wheel_omega
+    some = replace(test, windows=test.windows.replace(wheels=WheelSignals(wheel_omega=speed)))
     assert compared(some, *load_model("builtin")) == [simulated[1]]
-    none = replace(test, windows=test.windows.replace(auxiliary=Auxiliary()))
+    none = replace(test, windows=test.windows.replace(wheels=WheelSignals()))
     assert compared(none, *load_model("builtin")) == []

@@ -13,7 +13,7 @@ from vertiwm_jax import atomic
 from vertiwm_jax.env.observation import LAYOUT, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.learning import dataset, schema
-from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.models.registry import load_encoders
@@ -67,7 +67,7 @@ def test_drives_are_read_as_recorded(collected, maps):
     assert drives.state.shape == (40, STEPS + 1, 12) and terrain.worlds == 2
     assert np.all(drives.length == STEPS)
     np.testing.assert_array_equal(terrain.elevation, files.load_map(maps).elevation)
-    assert all(getattr(drives.auxiliary, name) is not None for name in schema.AUXILIARY)
+    assert all(getattr(drives.wheels, name) is not None for name in schema.WHEEL_SIGNALS)
     assert set(np.unique(drives.wheel_class)) == {GRASS, SAND}
     control = drives.control.reshape(-1, 2)
     assert 1 <= control[:, 0].min() < control[:, 0].max() <= 4
@@ -172,7 +172,7 @@ class Scripted:
 
     def step(self, command):
         state = np.asarray(next(self._states), np.float32)
-        return Observation(state, np.zeros(4, np.uint8), Auxiliary())
+        return Observation(state, np.zeros(4, np.uint8), WheelSignals())
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from rl.probes import ProbeParams, Staggered, Target
 
 from vertiwm_jax import machine, parallel
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.learning.fitting import Fit, FitConfig, FitInputs
 from vertiwm_jax.learning.objectives import RolloutLoss
 from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
@@ -204,7 +204,7 @@ def random_bits(leaf):
 def test_fitting_on_two_devices_is_fitting_on_one(two):
     config = WindowConfig(batch=16, context=2, horizon=4, validation=9)
     drives, terrain = dataset.load_drives([OPEN / "rigid"], "validation")
-    drives = jax.tree.map(lambda x: x[:1], replace(drives, auxiliary=Auxiliary()))
+    drives = jax.tree.map(lambda x: x[:1], replace(drives, wheels=WheelSignals()))
     model, params = KinematicBicycle(), bicycle_of(hmmwv())
     data = WindowData.of(config, (drives, terrain), (drives, terrain))
     problem = WindowProblem(model, RolloutLoss(model), config)

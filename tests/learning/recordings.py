@@ -38,7 +38,7 @@ def write(folder: Path, name: str = "a.npz", **changes: np.ndarray | None) -> Pa
     return folder / name
 
 
-def auxiliary(count: int = 25, steps: int = STEPS) -> dict[str, np.ndarray]:
+def wheel_signals(count: int = 25, steps: int = STEPS) -> dict[str, np.ndarray]:
     """All that may be recorded beside the states: random, of the usual magnitudes."""
     rng = np.random.default_rng(0)
     magnitudes = {

@@ -3,7 +3,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from learning.recordings import STEPS, auxiliary, drives, write
+from learning.recordings import STEPS, drives, wheel_signals, write
 
 from vertiwm_jax.learning import compact, dataset, windows
 from vertiwm_jax.terrain import files
@@ -21,7 +21,7 @@ def collections(folder: Path) -> Path:
         state = drives()["state"] + rng.normal(0, 1e-3, (25, STEPS + 1, 12))
         length = np.full(25, STEPS, np.int32)
         length[2] = 30
-        write(folder / kind, state=state, length=length, driver=np.ones(9), **auxiliary())
+        write(folder / kind, state=state, length=length, driver=np.ones(9), **wheel_signals())
         hill = terrain_map.build(rng.uniform(0, 9, (9, 9)), np.full((4, 4), 3))
         files.save(hill, folder / kind / "maps" / "hill.npz")
     (folder / "mixed" / "maps").rename(folder / "maps")
@@ -37,8 +37,8 @@ def test_compact_drives_are_the_recorded_ones_to_half_a_step(tmp_path):
     places = windows.index(theirs, their_maps, context=4, horizon=4)
     ours, theirs = (windows.gather(drives, places) for drives in (ours, theirs))
     arrays = {"state": (ours.state, theirs.state), "control": (ours.control, theirs.control)}
-    for name, recorded in vars(theirs.auxiliary).items():
-        arrays[name] = (getattr(ours.auxiliary, name), recorded)
+    for name, recorded in vars(theirs.wheels).items():
+        arrays[name] = (getattr(ours.wheels, name), recorded)
     assert arrays.keys() == compact.STEPS.keys()
     for name, (stored, recorded) in arrays.items():
         error = np.abs(np.asarray(stored, np.float64) - recorded)
@@ -104,6 +104,6 @@ def test_the_shipped_drives_are_whole():
         assert drives.state.shape == (48 * count, 251, 12)
         assert drives.length.min() > 200
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(drives))
-        assert len(jax.tree.leaves(drives.auxiliary)) == 5
+        assert len(jax.tree.leaves(drives.wheels)) == 5
         ground = windows.index(drives, terrain).ground
         assert (np.bincount(ground, minlength=3) > 100).all()

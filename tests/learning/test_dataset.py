@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 import pytest
-from learning.recordings import GRASS, SNOW, STEPS, auxiliary, drives, write
+from learning.recordings import GRASS, SNOW, STEPS, drives, wheel_signals, write
 
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.schema import DataError
@@ -51,31 +51,31 @@ def test_an_empty_folder_and_an_empty_split_are_refused(tmp_path):
 
 
 def test_drives_of_unequal_length_are_padded(tmp_path):
-    write(tmp_path, "a.npz", **drives(steps=30), **auxiliary(steps=30))
-    write(tmp_path, "b.npz", **auxiliary())
+    write(tmp_path, "a.npz", **drives(steps=30), **wheel_signals(steps=30))
+    write(tmp_path, "b.npz", **wheel_signals())
     loaded, _ = dataset.load_drives(tmp_path, "test")
     assert loaded.length.tolist() == [30, 30, 30, STEPS, STEPS, STEPS]
     assert loaded.state.shape == (6, STEPS + 1, 12)
     assert loaded.control.shape == (6, STEPS, 2)
-    assert loaded.auxiliary.wheel_force.shape == (6, STEPS + 1, 4, 3)
+    assert loaded.wheels.wheel_force.shape == (6, STEPS + 1, 4, 3)
     np.testing.assert_array_equal(loaded.state[:3, :31], drives()["state"][22:, :31])
     np.testing.assert_array_equal(loaded.state[3:], drives()["state"][22:])
 
 
 def test_what_was_recorded_beside_the_states_comes_along(tmp_path):
-    recorded = auxiliary()
+    recorded = wheel_signals()
     write(tmp_path, **{name: recorded[name] for name in ("wheel_omega", "chassis_force")})
     loaded, _ = dataset.load_drives(tmp_path, "validation")
-    np.testing.assert_array_equal(loaded.auxiliary.wheel_omega, recorded["wheel_omega"][20:22])
-    np.testing.assert_array_equal(loaded.auxiliary.chassis_force, recorded["chassis_force"][20:22])
-    assert loaded.auxiliary.wheel_sinkage is None
-    assert loaded.auxiliary.wheel_force is None
-    assert loaded.auxiliary.steer_angle is None
+    np.testing.assert_array_equal(loaded.wheels.wheel_omega, recorded["wheel_omega"][20:22])
+    np.testing.assert_array_equal(loaded.wheels.chassis_force, recorded["chassis_force"][20:22])
+    assert loaded.wheels.wheel_sinkage is None
+    assert loaded.wheels.wheel_force is None
+    assert loaded.wheels.steer_angle is None
 
 
 def test_half_a_recording_is_refused(tmp_path):
-    write(tmp_path, "a.npz", **auxiliary())
-    path = write(tmp_path, "b.npz", **{**auxiliary(), "wheel_omega": None})
+    write(tmp_path, "a.npz", **wheel_signals())
+    path = write(tmp_path, "b.npz", **{**wheel_signals(), "wheel_omega": None})
     with pytest.raises(
         DataError, match=r"wheel_omega: expected in all files .* missing in 1 of 2"
     ) as caught:

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from learning.recordings import STEPS, auxiliary, drives, write
+from learning.recordings import STEPS, drives, wheel_signals, write
 
 from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.learning.schema import DataError
@@ -18,7 +18,7 @@ def stretched(factor: float) -> np.ndarray:
 
 
 def spoilt(name: str, value: float) -> np.ndarray:
-    array = auxiliary()[name]
+    array = wheel_signals()[name]
     array[3, 7, 0] = value
     return array
 
@@ -130,7 +130,7 @@ def test_an_array_instead_of_an_archive_is_named(tmp_path):
 @pytest.mark.parametrize("write_archive", [np.savez, np.savez_compressed])
 def test_damage_anywhere_in_an_archive_is_one_error_or_none(tmp_path, write_archive):
     path = write(tmp_path)
-    write_archive(path, **drives(count=2), **auxiliary(count=2))
+    write_archive(path, **drives(count=2), **wheel_signals(count=2))
     content = path.read_bytes()
     rng = np.random.default_rng(0)
     named = 0

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learning.recordings import GRASS, SNOW, STEPS, auxiliary, write
+from learning.recordings import GRASS, SNOW, STEPS, wheel_signals, write
 
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning import windows as prediction_windows
@@ -48,20 +48,20 @@ def test_drives_shorter_than_a_window_are_refused(tmp_path):
 
 
 def test_windows_hold_what_was_recorded_beside_the_states(tmp_path):
-    recorded = auxiliary()
+    recorded = wheel_signals()
     write(tmp_path, wheel_force=recorded["wheel_force"], steer_angle=recorded["steer_angle"])
     loaded, terrain = dataset.load_drives(tmp_path, "test")
     windows = gather(loaded, index(loaded, terrain, context=12, horizon=8, stride=20))
     force = recorded["wheel_force"][22:]
     expected = np.stack([force[d, s : s + 21] for d in range(3) for s in (0, 20)])
-    np.testing.assert_array_equal(windows.auxiliary.wheel_force, expected)
-    assert windows.auxiliary.steer_angle.shape == (6, 21, 2)
-    assert windows.auxiliary.wheel_omega is None
+    np.testing.assert_array_equal(windows.wheels.wheel_force, expected)
+    assert windows.wheels.steer_angle.shape == (6, 21, 2)
+    assert windows.wheels.wheel_omega is None
 
 
 def test_a_gathered_batch_is_those_windows_of_all(tmp_path):
-    write(tmp_path, "a.npz", **auxiliary())
-    write(tmp_path, "b.npz", **auxiliary())
+    write(tmp_path, "a.npz", **wheel_signals())
+    write(tmp_path, "b.npz", **wheel_signals())
     loaded, terrain = dataset.load_drives(tmp_path, "train")
     every = gather(loaded, index(loaded, terrain, context=6, horizon=4))
     places = prediction_windows.index(loaded, terrain, context=6, horizon=4)

@@ -15,7 +15,7 @@ from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason as Reason
-from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.simulators.builtin import BuiltIn
@@ -72,7 +72,7 @@ class Ghost:
         return self._seen()
 
     def _seen(self):
-        return Observation(self.state, np.zeros(4, np.uint8), Auxiliary())
+        return Observation(self.state, np.zeros(4, np.uint8), WheelSignals())
 
 
 def haunted(*changes):

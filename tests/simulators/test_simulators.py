@@ -63,7 +63,7 @@ def test_a_start_is_at_rest(kind):
     np.testing.assert_allclose(seen.state[5], 1.0, atol=0.05)
     np.testing.assert_allclose(seen.state[6:], 0.0, atol=creep)
     assert seen.state.shape == (12,) and np.all(seen.wheel_class == CONCRETE)
-    wheels = seen.auxiliary
+    wheels = seen.wheels
     np.testing.assert_allclose(wheels.wheel_sinkage, 0.0, atol=0.02)
     np.testing.assert_allclose(wheels.wheel_omega, 0.0, atol=3 * creep)
     np.testing.assert_allclose(wheels.wheel_force.sum(0), [0, 0, WEIGHT], atol=0.03 * WEIGHT)
@@ -77,10 +77,10 @@ def test_commands_are_followed_and_wheels_roll(kind):
     speed, yaw_rate = last.state[6], last.state[11]
     assert 2.0 < speed < 3.1
     np.testing.assert_allclose(yaw_rate, speed * np.tan(0.2) / 3.302, rtol=0.2)
-    np.testing.assert_allclose(last.auxiliary.steer_angle, 0.2, atol=0.05)
-    np.testing.assert_allclose(last.auxiliary.wheel_omega.mean(), speed / 0.467, rtol=0.1)
+    np.testing.assert_allclose(last.wheels.steer_angle, 0.2, atol=0.05)
+    np.testing.assert_allclose(last.wheels.wheel_omega.mean(), speed / 0.467, rtol=0.1)
     # Turning left, the ground pushes inwards with m v omega.
-    force, yaw = last.auxiliary.wheel_force.sum(0), last.state[5]
+    force, yaw = last.wheels.wheel_force.sum(0), last.state[5]
     inwards = -np.sin(yaw) * force[0] + np.cos(yaw) * force[1]
     np.testing.assert_allclose(inwards, WEIGHT / GRAVITY * speed * yaw_rate, rtol=0.3)
     # v_body is how the position moves.
@@ -94,7 +94,7 @@ def test_commands_are_followed_and_wheels_roll(kind):
 def test_wheels_sink_into_soil_alone(kind):
     seen = drive(kind(ground(east=SNOW)), (155.0, 0.0, 0.0), np.tile([3.0, 0.0], (70, 1)))
     assert np.all(seen.wheel_class[0] == CONCRETE) and np.all(seen.wheel_class[-1] == SNOW)
-    sinkage = seen.auxiliary.wheel_sinkage
+    sinkage = seen.wheels.wheel_sinkage
     assert np.all(np.abs(sinkage[0]) < 0.02) and np.all(sinkage[-1] > 0.01)
     assert np.all(sinkage[-1] < 0.3)
 
@@ -131,10 +131,10 @@ def test_forces_of_the_built_in_simulator_are_what_moves_it():
     rotation = Rotation.from_euler("ZYX", seen.state[:, 5:2:-1]).as_matrix()
     velocity = seen.state[:, 6:9] + np.cross(seen.state[:, 9:], centre)
     momentum = mass * np.einsum("tij,tj->ti", rotation, velocity)
-    force = seen.auxiliary.wheel_force.sum(1) + seen.auxiliary.chassis_force
+    force = seen.wheels.wheel_force.sum(1) + seen.wheels.chassis_force
     found = 0.1 * (force[1:] - [0, 0, WEIGHT])
     np.testing.assert_allclose(found, np.diff(momentum, axis=0), atol=0.003 * WEIGHT)
-    assert np.abs(seen.auxiliary.chassis_force).max() > 0.1 * WEIGHT
+    assert np.abs(seen.wheels.chassis_force).max() > 0.1 * WEIGHT
 
 
 @without

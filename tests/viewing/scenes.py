@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from env.worlds import SNOW, hills
 
-from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.viewing.scene import Prediction, Scene
 
@@ -28,7 +28,7 @@ def scene() -> Scene:
         terrain=terrain,
         state=state,
         command=np.stack([3 + time[:-1], 0.1 * time[:-1]], axis=1),
-        wheels=Auxiliary(
+        wheels=WheelSignals(
             wheel_omega=np.full((STEPS + 1, 4), 5.0),
             wheel_sinkage=rng.uniform(-0.1, 0.1, (STEPS + 1, 4)),
         ),

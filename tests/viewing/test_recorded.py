@@ -30,7 +30,7 @@ class Fused:
 
 
 def test_predictions_from_recorded_states(tmp_path):
-    path = recordings.write(tmp_path, **recordings.auxiliary())
+    path = recordings.write(tmp_path, **recordings.wheel_signals())
     scene = recorded.load(path, 3, "constant", ConstantVelocity(), None)
     assert scene.title == "a, drive 3, and constant" and scene.steps == recordings.STEPS
     expected = recordings.drives()

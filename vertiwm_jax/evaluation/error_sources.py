@@ -47,7 +47,7 @@ def locate(test: TestWindows, error: np.ndarray) -> list[Share]:
         "ground under the vehicle": [test.terrain.class_names[i] for i in kind],
         "border of soil, m away": _binned(distance, DISTANCES),
     }
-    force = test.windows.auxiliary.chassis_force
+    force = test.windows.wheels.chassis_force
     if force is not None:
         touched = np.linalg.norm(force[:, c + 1 :], axis=-1).max(axis=1) > 0
         quantities["belly"] = [("free", "on the ground")[i] for i in touched.astype(int)]

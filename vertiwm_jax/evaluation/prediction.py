@@ -14,7 +14,7 @@ from vertiwm_jax.dynamics import Dynamics, History, Params, disagreement, spread
 from vertiwm_jax.evaluation.published import POSITION_ERRORS
 from vertiwm_jax.evaluation.tables import markdown
 from vertiwm_jax.learning import windows as recorded
-from vertiwm_jax.learning.dataset import Auxiliary, Drives
+from vertiwm_jax.learning.dataset import Drives, WheelSignals
 from vertiwm_jax.learning.objectives import open_loop
 from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.mechanics.simulator import SimulatorHistory
@@ -100,7 +100,7 @@ class Reading(NamedTuple):
     coefficients: Any
     disagreement: Any
     spread: Any
-    wheels: Auxiliary | None
+    wheels: WheelSignals | None
 
     @classmethod
     def of(cls, history: History) -> Self:
@@ -109,7 +109,7 @@ class Reading(NamedTuple):
         return cls(alpha, disagreement(history), spread(history), modelled(history))
 
 
-def modelled(history: History) -> Auxiliary | None:
+def modelled(history: History) -> WheelSignals | None:
     """What a model keeps of its wheels, if it has any; forces are of the last sub-step."""
     match history:
         case VertiWMHistory(nesam=specialist) | AloneHistory(specialist=specialist):
@@ -117,7 +117,7 @@ def modelled(history: History) -> Auxiliary | None:
         case NesamHistory(simulator=memory):
             return modelled(memory)
         case SimulatorHistory(wheel_speed=speed, sinkage=sinkage, force=force):
-            return Auxiliary(wheel_omega=speed, wheel_sinkage=sinkage, wheel_force=force)
+            return WheelSignals(wheel_omega=speed, wheel_sinkage=sinkage, wheel_force=force)
     return None
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.evaluation.tables import markdown
-from vertiwm_jax.learning.dataset import Array, Auxiliary
+from vertiwm_jax.learning.dataset import Array, WheelSignals
 from vertiwm_jax.learning.windows import GROUNDS
 
 
@@ -28,12 +28,12 @@ class WheelError:
     correlation: float
 
 
-def compare(predicted: Auxiliary | None, test: TestWindows) -> list[WheelError]:
+def compare(predicted: WheelSignals | None, test: TestWindows) -> list[WheelError]:
     """Sinkage in soil, speed and force of wheels; nothing of what is not modelled or recorded.
 
     predicted: leaves `[N, K, 4, ...]`, by a model that has wheels.
     """
-    recorded, predicted = test.windows.auxiliary, predicted or Auxiliary()
+    recorded, predicted = test.windows.wheels, predicted or WheelSignals()
     found = []
     for name, read in _QUANTITIES.items():
         truth, ours = read(recorded), read(predicted)
@@ -61,18 +61,18 @@ def format_table(errors: Sequence[WheelError]) -> str:
 _SINKAGE = "sinkage, mm"
 
 
-def _sinkage(wheels: Auxiliary) -> jax.Array | None:
+def _sinkage(wheels: WheelSignals) -> jax.Array | None:
     # A recorded wheel that is in the air is above the ground, a modelled one has not sunk.
     depth = wheels.wheel_sinkage
     return None if depth is None else 1000 * jnp.maximum(depth, 0.0)
 
 
-def _force(wheels: Auxiliary) -> jax.Array | None:
+def _force(wheels: WheelSignals) -> jax.Array | None:
     force = wheels.wheel_force
     return None if force is None else jnp.linalg.norm(force, axis=-1) / 1000
 
 
-_QUANTITIES: Mapping[str, Callable[[Auxiliary], Array | None]] = {
+_QUANTITIES: Mapping[str, Callable[[WheelSignals], Array | None]] = {
     _SINKAGE: _sinkage,
     "speed, rad/s": operator.attrgetter("wheel_omega"),
     "force, kN": _force,

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax import geometry
-from vertiwm_jax.learning.dataset import Array, Auxiliary
+from vertiwm_jax.learning.dataset import Array, WheelSignals
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.terrain.map import MapError, TerrainMap
 
@@ -63,7 +63,7 @@ def mirror(windows: Windows, terrain: TerrainMap) -> Windows:
         state=jnp.concatenate([*position, rpy, velocity], axis=-1),
         control=control * jnp.array([1.0, -1.0]),
         world=windows.world + terrain.worlds // 2,
-        auxiliary=_mirror_auxiliary(windows.auxiliary),
+        wheels=_mirror_wheels(windows.wheels),
     )
 
 
@@ -84,12 +84,12 @@ def _across(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     return centre + (xy - centre)[..., ::-1]
 
 
-def _mirror_auxiliary(recorded: Auxiliary) -> Auxiliary:
+def _mirror_wheels(recorded: WheelSignals) -> WheelSignals:
     def other_side(wheels: Array | None) -> Array | None:
         return None if wheels is None else wheels[..., _OTHER_SIDE]
 
     force, chassis, steer = recorded.wheel_force, recorded.chassis_force, recorded.steer_angle
-    return Auxiliary(
+    return WheelSignals(
         wheel_omega=other_side(recorded.wheel_omega),
         wheel_sinkage=other_side(recorded.wheel_sinkage),
         wheel_force=None if force is None else force[..., _OTHER_SIDE, :][..., _EXCHANGED],

@@ -30,8 +30,8 @@ Array = np.ndarray | jax.Array
 
 
 @struct.dataclass
-class Auxiliary:
-    """Recorded signals of wheels and chassis, None where missing. Wheels are FL, FR, RL, RR.
+class WheelSignals:
+    """Signals of wheels and chassis, None where missing. Wheels are FL, FR, RL, RR.
 
     wheel_omega: `[..., 4]` rad/s, positive forward.
     wheel_sinkage: `[..., 4]` m below the undeformed ground; negative in the air.
@@ -53,7 +53,7 @@ class Drives:
 
     state: `[D, T + 1, 12]` float32; control: `[D, T, 2]` float32; length: `[D]` valid steps, later
     values have no meaning; wheel_class: `[D, T + 1, 4]` uint8; world: `[D]` index into
-    the terrain map; auxiliary: leaves `[D, T + 1, ...]` float32.
+    the terrain map; wheels: leaves `[D, T + 1, ...]` float32.
     """
 
     state: Array
@@ -61,7 +61,7 @@ class Drives:
     length: Array
     wheel_class: Array
     world: Array
-    auxiliary: Auxiliary
+    wheels: WheelSignals
 
 
 def load_drives(
@@ -157,5 +157,7 @@ def _join(paths: list[Path], parts: list[dict[str, np.ndarray]]) -> Drives:
         return np.concatenate(arrays)
 
     joined = {name: padded(name) for name in sorted(every)}
-    auxiliary = Auxiliary(**{name: joined.pop(name) for name in schema.AUXILIARY if name in joined})
-    return Drives(**joined, auxiliary=auxiliary)
+    signals = WheelSignals(
+        **{name: joined.pop(name) for name in schema.WHEEL_SIGNALS if name in joined}
+    )
+    return Drives(**joined, wheels=signals)

@@ -18,7 +18,7 @@ from vertiwm_jax.config import settings
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning import autoencoders, calibration, dataset, stages, windows
 from vertiwm_jax.learning.autoencoders import AutoencoderConfig, AutoencoderProblem, PatchData
-from vertiwm_jax.learning.dataset import Auxiliary, Drives, Split
+from vertiwm_jax.learning.dataset import Drives, Split, WheelSignals
 from vertiwm_jax.learning.fitting import FitConfig, Problem
 from vertiwm_jax.learning.losses import LossConfig
 from vertiwm_jax.learning.objectives import RolloutLoss, TeacherForcingLoss
@@ -298,7 +298,7 @@ class _Pipeline:
         key = tuple(kinds), split
         if key not in self.loaded:
             drives, terrain = dataset.load_drives(self._folders(kinds), split)
-            self.loaded[key] = replace(drives, auxiliary=Auxiliary()), terrain
+            self.loaded[key] = replace(drives, wheels=WheelSignals()), terrain
         return self.loaded[key]
 
     def _folders(self, kinds: Sequence[Kind]) -> list[Path]:

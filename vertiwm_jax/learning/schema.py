@@ -39,7 +39,7 @@ _REQUIRED = {
     "control": ("K", "T", 2),
     "length": ("K",),
 }
-AUXILIARY = {
+WHEEL_SIGNALS = {
     "wheel_omega": ("K", "T + 1", 4),
     "wheel_sinkage": ("K", "T + 1", 4),
     "wheel_force": ("K", "T + 1", 4, 3),
@@ -47,8 +47,8 @@ AUXILIARY = {
     "steer_angle": ("K", "T + 1", 2),
 }
 """Shapes of what may be recorded beside the states."""
-_SHAPES = {**_REQUIRED, "wheel_class": ("K", "T + 1", 4), **AUXILIARY}
-_FLOATS = ("state", "control", *AUXILIARY)
+_SHAPES = {**_REQUIRED, "wheel_class": ("K", "T + 1", 4), **WHEEL_SIGNALS}
+_FLOATS = ("state", "control", *WHEEL_SIGNALS)
 
 _LARGEST = {
     "wheel_omega": (1e3, "wheel speed in rad/s"),
@@ -213,7 +213,9 @@ def _check_values(path: Path, arrays: dict[str, np.ndarray]) -> None:
         ("control", control[:, 0], _LARGEST_SPEED, "commanded speed in m/s"),
         ("control", control[:, 1], np.pi / 2, "front-wheel angle in rad"),
     ]
-    limits += [(name, arrays[name][valid], *_LARGEST[name]) for name in AUXILIARY if name in arrays]
+    limits += [
+        (name, arrays[name][valid], *_LARGEST[name]) for name in WHEEL_SIGNALS if name in arrays
+    ]
     for name, values, limit, meaning in limits:
         bad = ~(np.abs(values) <= limit)
         if bad.any():

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax.learning.dataset import Array, Auxiliary, Drives
+from vertiwm_jax.learning.dataset import Array, Drives, WheelSignals
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -36,7 +36,7 @@ class Windows:
 
     state: `[N, C + K + 1, 12]`; control: `[N, C + K, 2]`; world: `[N]`;
     ground: `[N]` index into `GROUNDS`, over the predicted steps; context: C, static;
-    auxiliary: leaves `[N, C + K + 1, ...]`, as far as the drives have them.
+    wheels: leaves `[N, C + K + 1, ...]`, as far as the drives have them.
     """
 
     state: jax.Array
@@ -44,7 +44,7 @@ class Windows:
     world: jax.Array
     ground: jax.Array
     context: int = struct.field(pytree_node=False)
-    auxiliary: Auxiliary = Auxiliary()
+    wheels: WheelSignals = WheelSignals()
 
 
 def index(
@@ -97,5 +97,5 @@ def gather(drives: Drives, index: WindowIndex) -> Windows:
         world=jnp.asarray(drives.world)[index.drive],
         ground=index.ground,
         context=index.context,
-        auxiliary=jax.tree.map(partial(cut_out, steps=steps), drives.auxiliary),
+        wheels=jax.tree.map(partial(cut_out, steps=steps), drives.wheels),
     )

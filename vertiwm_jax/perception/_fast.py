@@ -22,7 +22,7 @@ from jax.custom_batching import custom_vmap
 from vertiwm_jax.networks.encoder import LATENT_CHANNELS
 from vertiwm_jax.perception.features import Encoders, TerrainFeatures, features
 from vertiwm_jax.state import VehicleState
-from vertiwm_jax.terrain import grid, patches
+from vertiwm_jax.terrain import _raster, patches
 from vertiwm_jax.terrain.map import ObservedMap, TerrainMap
 from vertiwm_jax.terrain.patches import CELL_PIXELS, RELIEF_METRES
 
@@ -235,9 +235,9 @@ def _read_heights(
     _, rows, columns = terrain.elevation.shape
     last = np.array([[columns - 1], [rows - 1]])
     first = jnp.minimum(_first(middles, around, last).astype(jnp.int32), last - 2)
-    vertices = grid.flat_index(terrain, rows, columns, first[1], first[0])[:, None]
+    vertices = _raster.flat_index(terrain, rows, columns, first[1], first[0])[:, None]
     vertices += (columns * np.arange(3)[:, None] + np.arange(3)).ravel()
-    heights = (grid.gather(terrain.elevation, vertices) - height) / RELIEF_METRES
+    heights = (_raster.gather(terrain.elevation, vertices) - height) / RELIEF_METRES
     surface = jnp.dot(heights, _HINGES, precision="highest")
     return surface, middles - first, jnp.float32(-first), jnp.float32(last - first)
 
@@ -269,10 +269,10 @@ def _read_colors(
     classes_a_vertex = ((last_class + 1) / last).astype(np.float32)
     least = _first(middles, around, last) * classes_a_vertex
     first = jnp.minimum(least.astype(jnp.int32), last_class - 1)
-    classes = grid.flat_index(terrain, class_rows, class_columns, first[1], first[0])[:, None]
+    classes = _raster.flat_index(terrain, class_rows, class_columns, first[1], first[0])[:, None]
     classes += (class_columns * np.arange(2)[:, None] + np.arange(2)).ravel()
     palette = jnp.sum(terrain.class_rgb.astype(jnp.int32) << _BYTES, axis=1)
-    colors = grid.gather(palette, grid.gather(terrain.semantic, classes).astype(jnp.int32))
+    colors = _raster.gather(palette, _raster.gather(terrain.semantic, classes).astype(jnp.int32))
     return colors, ((first + 1) / classes_a_vertex - middles).T
 
 

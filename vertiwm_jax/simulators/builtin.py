@@ -6,7 +6,7 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax import geometry
-from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.simulator import (
     GroundForces,
@@ -81,7 +81,7 @@ def _observe(params: SimulatorParams, terrain: TerrainMap, moving: _Moving) -> O
     # Written out: a matmul may round map coordinates to ten bits on an accelerator.
     centre = state.position + jnp.sum(rotation * in_body[:, None, :], axis=-1)
     wheel_class, depth = under_wheels(terrain, centre, vehicle.wheel_radius)
-    wheels = Auxiliary(
+    wheels = WheelSignals(
         wheel_omega=history.wheel_speed,
         wheel_sinkage=depth,
         wheel_force=moving.forces.wheels,

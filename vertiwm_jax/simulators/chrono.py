@@ -15,7 +15,7 @@ import jaxlie
 import numpy as np
 
 from vertiwm_jax import geometry
-from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.mechanics.vehicle import hmmwv
 from vertiwm_jax.simulators.chrono_ground import Ground
 from vertiwm_jax.simulators.protocol import (
@@ -84,11 +84,11 @@ class Chrono:
         return self._observe(self._drive)
 
     def _observe(self, drive: "_Drive") -> Observation:
-        pose, twist, wheels, auxiliary = drive.read()
+        pose, twist, wheels, signals = drive.read()
         pose[:2] += self._ground.middle
         wheels[:, :2] += self._ground.middle
         state, kind, depth = jax.device_get(_observed(self._terrain, pose, twist, wheels))
-        return Observation(state, kind, replace(auxiliary, wheel_sinkage=depth))
+        return Observation(state, kind, replace(signals, wheel_sinkage=depth))
 
 
 @jax.jit
@@ -213,21 +213,21 @@ class _Drive:
                     forces[k] += _numbers(force)
         return forces
 
-    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Auxiliary]:
+    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, WheelSignals]:
         """The arguments of `_observed`, and the state of the wheels except their sinkage."""
         frame, spindles = self._car.GetRefFrame(), self._spindles
         q = frame.GetRot()
         pose = np.array([*_numbers(frame.GetPos()), q.e0, q.e1, q.e2, q.e3], np.float32)
         twist = np.array([*_numbers(frame.GetPosDt()), *_numbers(frame.GetAngVelLocal())])
         steering = [self._vehicle.GetSteeringAngle(*corner) for corner in self._corners[:2]]
-        auxiliary = Auxiliary(
+        signals = WheelSignals(
             wheel_omega=np.array([s.GetAngVelLocal().y for s in spindles], np.float32),
             wheel_force=self._forces[:4].astype(np.float32),
             chassis_force=self._forces[4].astype(np.float32),
             steer_angle=np.array(steering, np.float32),
         )
         wheels = np.array([_numbers(s.GetPos()) for s in spindles], np.float32)
-        return pose, twist.astype(np.float32), wheels, auxiliary
+        return pose, twist.astype(np.float32), wheels, signals
 
     def __del__(self) -> None:
         # What refers to the Chrono system must go before the system itself.

@@ -291,7 +291,7 @@ def _arrays(drive: Drive) -> dict[str, np.ndarray]:
     """Arrays of the schema `[T + 1, ...]`, of the control `[T, 2]`."""
     seen = jax.tree.map(lambda *x: np.stack(x), *drive.observations)
     arrays = {"state": seen.state, "control": drive.control, "wheel_class": seen.wheel_class}
-    known = {name: getattr(seen.auxiliary, name) for name in schema.AUXILIARY}
+    known = {name: getattr(seen.wheels, name) for name in schema.WHEEL_SIGNALS}
     return arrays | {name: array for name, array in known.items() if array is not None}
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax.errors import UserError
-from vertiwm_jax.learning.dataset import Array, Auxiliary
+from vertiwm_jax.learning.dataset import Array, WheelSignals
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -28,12 +28,12 @@ class Observation:
 
     state: `[12]` as `VehicleState.vector`, of the body origin between the wheel centres.
     wheel_class: `[4]` uint8, ground class under each wheel.
-    auxiliary: state of the wheels, where known; forces are means over the last step.
+    wheels: state of the wheels, where known; forces are means over the last step.
     """
 
     state: Array
     wheel_class: Array
-    auxiliary: Auxiliary
+    wheels: WheelSignals
 
 
 class Simulator(Protocol):

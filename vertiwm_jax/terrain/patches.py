@@ -9,7 +9,7 @@ from flax import struct
 
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.state import STEP_SECONDS
-from vertiwm_jax.terrain import grid
+from vertiwm_jax.terrain import _raster
 from vertiwm_jax.terrain.map import TerrainMap
 
 PATCH_PIXELS = 128
@@ -85,11 +85,11 @@ def pixels(
     terrain: TerrainMap, middles: jax.Array, around: jax.Array, height: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Elevations `[256, 64]` above a height `[]`, m, and colors `[256, 3, 64]`, at `places`."""
-    column, row = grid.on_map(terrain, *(middles[:, :, None] + around[:, None]))
-    elevation = jnp.clip((grid.bilinear(terrain, row, column) - height) / RELIEF_METRES, -1, 1)
-    semantic = grid.classes(terrain, row, column, grid.cell_index(terrain, row, column))
+    column, row = _raster.on_map(terrain, *(middles[:, :, None] + around[:, None]))
+    elevation = jnp.clip((_raster.bilinear(terrain, row, column) - height) / RELIEF_METRES, -1, 1)
+    semantic = _raster.classes(terrain, row, column, _raster.cell_index(terrain, row, column))
     palette = terrain.class_rgb / 127.5 - 1
-    return elevation, jnp.stack([grid.gather(c, semantic) for c in palette.T], axis=1)
+    return elevation, jnp.stack([_raster.gather(c, semantic) for c in palette.T], axis=1)
 
 
 def footprint_covered(

@@ -1,10 +1,10 @@
-"""The ground under points of a map; `grid` says what lies off the map."""
+"""The ground under points of a map; `_raster` says what lies off the map."""
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.terrain import grid
+from vertiwm_jax.terrain import _raster
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
 
@@ -33,10 +33,10 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
     to `xy` is `gradient`.
     """
     column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
-    cell = grid.cell_index(terrain, row, column)
-    semantic = grid.classes(terrain, row, column, cell)
-    soft = grid.gather(terrain.deformable, semantic)
-    bottom_left, along, up, twist, fx, fy = grid.corners(terrain, row, column)
+    cell = _raster.cell_index(terrain, row, column)
+    semantic = _raster.classes(terrain, row, column, cell)
+    soft = _raster.gather(terrain.deformable, semantic)
+    bottom_left, along, up, twist, fx, fy = _raster.corners(terrain, row, column)
     rising = fx > fy
     height = (
         bottom_left
@@ -49,11 +49,11 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
     slope_y = up + twist * jnp.where(soft, fx, jnp.where(rising, 1.0, 0.0))
     gradient = jnp.stack([slope_x, slope_y], axis=-1) / terrain.resolution
     gradient = jnp.where(_inside(terrain, xy), gradient, 0.0)
-    friction = grid.gather(terrain.friction, cell)
+    friction = _raster.gather(terrain.friction, cell)
     if terrain.grip is not None:
         friction = terrain.grip * friction
     if terrain.observed is not None:
-        known = grid.known(terrain, terrain.observed, row, column)
+        known = _raster.known(terrain, terrain.observed, row, column)
         friction = jnp.where(known, friction, terrain.observed.friction)
     return Surface(height, gradient, semantic, friction)
 
@@ -71,7 +71,7 @@ def soils(terrain: TerrainMap) -> Soil:
 def height(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     """`[..., 2]` p_world to `[...]` bilinear height, m, whatever the class."""
     column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
-    return grid.bilinear(terrain, row, column)
+    return _raster.bilinear(terrain, row, column)
 
 
 def known(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
@@ -79,7 +79,7 @@ def known(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     if terrain.observed is None:
         return jnp.ones(xy.shape[:-1], bool)
     column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
-    return grid.known(terrain, terrain.observed, row, column)
+    return _raster.known(terrain, terrain.observed, row, column)
 
 
 def _grid_coordinates(
@@ -88,7 +88,7 @@ def _grid_coordinates(
     """Points to fractional (column, row) of the vertices, on the map."""
     column = (x - terrain.origin[0]) / terrain.resolution
     row = (terrain.origin[1] - y) / terrain.resolution
-    return grid.on_map(terrain, column, row)
+    return _raster.on_map(terrain, column, row)
 
 
 def _inside(terrain: TerrainMap, xy: jax.Array) -> jax.Array:

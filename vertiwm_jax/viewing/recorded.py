@@ -39,7 +39,7 @@ def load(path: Path, drive: int, name: str, dynamics: Dynamics, params: Params) 
         terrain=terrain,
         state=np.asarray(alone.state)[0, : length + 1],
         command=np.asarray(alone.control)[0, :length],
-        wheels=jax.tree.map(lambda x: x[0, : length + 1], alone.auxiliary),
+        wheels=jax.tree.map(lambda x: x[0, : length + 1], alone.wheels),
         prediction=predict(dynamics, params, terrain, alone),
     )
 

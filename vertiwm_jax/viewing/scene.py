@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import jax
 import numpy as np
 
-from vertiwm_jax.learning.dataset import Auxiliary
+from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.map import TerrainMap
@@ -62,7 +62,7 @@ class Scene:
     terrain: TerrainMap
     state: np.ndarray
     command: np.ndarray
-    wheels: Auxiliary | None = None
+    wheels: WheelSignals | None = None
     coefficients: np.ndarray | None = None
     goal: np.ndarray | None = None
     goal_radius: float = 0.0
