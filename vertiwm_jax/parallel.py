@@ -112,7 +112,10 @@ def with_axis(name: str, specs: Any) -> Any:
 
 def gather(mesh: Mesh, tree: T) -> T:
     """Whole arrays on this host's first device; their types know of no mesh."""
-    put = jax.device_put(tree, shardings(mesh)) if mesh.is_multi_process else place(mesh, tree)
+    if mesh.is_multi_process:
+        put = jax.jit(lambda leaves: leaves, out_shardings=shardings(mesh))(tree)
+    else:
+        put = place(mesh, tree)
     return jax.tree.map(lambda leaf: leaf.addressable_data(0), put)
 
 

@@ -96,8 +96,8 @@ def test_training_reconstructs_better_and_gives_encoders(data, params, tmp_path)
     encoders = autoencoders.encoders(fitted)
     seen = patches.query(data.terrain, data.places.position[0], data.places.yaw[0])
     for channels, weights, patch in (
-        (1, encoders.elevation, seen.elevation[..., None]),
-        (3, encoders.semantic, seen.rgb),
+        (1, encoders["elevation"], seen.elevation[..., None]),
+        (3, encoders["semantic"], seen.rgb),
     ):
         latent = TerrainEncoder(channels).apply(weights, patch)
         assert latent.shape == (16, 16, 18)
@@ -110,7 +110,7 @@ def test_training_reconstructs_better_and_gives_encoders(data, params, tmp_path)
     ("change", "message"),
     [
         ({"batch": 0}, "batch: expected at least 1, found 0"),
-        ({"offset": -1.0}, "offset: expected at least 0 m"),
+        ({"offset": -1.0}, "offset: expected at least 0, found -1.0"),
     ],
 )
 def test_settings_out_of_range_are_refused(change, message):

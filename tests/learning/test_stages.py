@@ -74,21 +74,23 @@ def test_a_stage_that_has_ended_is_not_repeated(new_run):
         {"before": ("another stage",)},
     ],
 )
-def test_a_stage_whose_inputs_have_changed_begins_anew(new_run, change, capsys):
+def test_a_stage_whose_inputs_have_changed_begins_anew(new_run, change, caplog):
+    caplog.set_level("INFO")
     run = new_run()
     go(run)
     other = replace(INPUTS, **change)
     found, fitted = go(run, other)
-    assert fitted and "its inputs have changed" in capsys.readouterr().out
+    assert fitted and "its inputs have changed" in caplog.text
     assert go(run, other) == (found, False)
     assert other.digest != INPUTS.digest
 
 
-def test_a_stage_is_taken_over_from_another_run_if_it_is_the_same(new_run, capsys):
+def test_a_stage_is_taken_over_from_another_run_if_it_is_the_same(new_run, caplog):
+    caplog.set_level("INFO")
     one, two = new_run("one"), new_run("two")
     first, _ = go(one)
     assert go(two, reuse=[new_run("empty").folder, one.folder]) == (first, False)
-    assert f"stage: from {one.folder}" in capsys.readouterr().out
+    assert f"stage: from {one.folder}" in caplog.text
     assert runs.read_metrics(two.folder / "stage") == runs.read_metrics(one.folder / "stage")
     _, fitted = go(new_run("three"), replace(INPUTS, problem=Pull(1.0)), [one.folder])
     assert fitted
