@@ -125,6 +125,7 @@ checkpoints.save(sys.argv[1], 2, state(2.0), keep=1)
 
 
 @pytest.mark.parametrize("kill", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.integration
 def test_a_write_stopped_in_the_middle_leaves_a_good_checkpoint(tmp_path, kill):
     writer = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(tmp_path)],

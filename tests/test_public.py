@@ -27,6 +27,7 @@ def test_every_public_name_is_there_and_documented():
         vw.fly  # noqa: B018
 
 
+@pytest.mark.integration
 def test_a_vehicle_is_driven_on_a_map():
     ground = vw.make_worlds(1)
     model, params = vw.load_model("builtin", vehicle=vw.load_vehicle("hmmwv"))

@@ -26,6 +26,7 @@ def numbers(found):
         yield found
 
 
+@pytest.mark.integration
 def test_small_run_measures_all_parts(tmp_path):
     file = tmp_path / "results" / "gpu.json"
     command = [sys.executable, "-m", "benchmarks.gpu", "--small", "--minutes", "20"]
@@ -97,6 +98,7 @@ def test_cases_begin_while_there_is_time(bench, monkeypatch):
     assert 0.2 <= found["seconds"] < 5
 
 
+@pytest.mark.integration
 def test_differences_beyond_tolerance_and_nan_are_failures(bench, monkeypatch):
     cases = dict(gpu.correctness(bench))
     assert list(cases) == [f"{name}, default precision" for name in (*bench.models, "PPO")]

@@ -48,6 +48,7 @@ def stepped(config, dynamics, params, terrain, encoders=None):
 
 
 @pytest.mark.parametrize("name", ["vertiwm", "builtin"])
+@pytest.mark.integration
 def test_an_observation_ends_with_the_ground_as_the_encoders_see_it(name, terrain):
     moves = load_model(name, embeddings=True)
     env, seen, state = stepped(CONFIG, *moves, terrain, load_encoders())
@@ -61,6 +62,7 @@ def test_an_observation_ends_with_the_ground_as_the_encoders_see_it(name, terrai
         np.testing.assert_allclose(found, expected[row, column], atol=1e-4)
 
 
+@pytest.mark.integration
 def test_seeing_does_not_change_how_a_model_moves(terrain):
     moves = load_model("builtin")
     _, seen, state = stepped(CONFIG, *moves, terrain, load_encoders())

@@ -21,6 +21,7 @@ def short():
 
 
 @pytest.mark.filterwarnings("error", "ignore:.*not having a spec")
+@pytest.mark.integration
 def test_single_passes_gymnasium_s_own_check(short):
     check_env(NavigationGymEnv(*short, render_mode="rgb_array"))
 
@@ -92,6 +93,7 @@ def test_vector_agrees_with_single(short):
 
 
 @pytest.mark.filterwarnings("error")
+@pytest.mark.integration
 def test_the_task_is_made_by_its_name():
     settings = {"terrain": ground(hills()), "model": "bicycle", "pairs": 2}
     single = gymnasium.make(vertiwm_jax.gym.NAME, **settings)

@@ -24,6 +24,7 @@ def test_it_is_made_by_name():
     assert GYMNAX_NAME in gymnax.registered_envs
 
 
+@pytest.mark.integration
 def test_random_rollouts_in_gymnax_s_own_way(made):
     env, env_params = made
 
@@ -53,6 +54,7 @@ def test_random_rollouts_in_gymnax_s_own_way(made):
     assert len(np.unique(info["distance"][:, 2])) > 1
 
 
+@pytest.mark.integration
 def test_settings_decide_worlds_and_tasks(made):
     env, env_params = made
     assert env_params.terrain.worlds == 2 and env_params.pool_size == 5

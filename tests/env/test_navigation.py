@@ -117,6 +117,7 @@ class Doubtful(Scripted):
         return state, Divided(steps, 0.01 * moved, 0.001 * moved)
 
 
+@pytest.mark.integration
 def test_disagreement_within_a_model_costs_reward_and_ends_what_nobody_can_tell():
     script = drive([1.0, 2.0, 3.0, np.nan])
     alone = play(script, 4)
@@ -129,6 +130,7 @@ def test_disagreement_within_a_model_costs_reward_and_ends_what_nobody_can_tell(
     assert endings(ended) == ["RUNNING", "RUNNING", "DIVERGED"]
 
 
+@pytest.mark.integration
 def test_many_starts_are_those_of_each():
     terrain = ground(hills())
     many = circle_tasks(terrain, radius=50.0, pairs=300)
@@ -221,6 +223,7 @@ def test_step_compiles_once_and_resets_by_itself():
 
 
 @pytest.mark.parametrize("name", get_args(ModelName))
+@pytest.mark.integration
 def test_a_model_is_traced_once_for_starts_and_for_steps(name, monkeypatch):
     model, params = task_of_learning.dynamics(TaskConfig(operands="float32"), name)
     traced, step = [], type(model).step

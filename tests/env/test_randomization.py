@@ -44,6 +44,7 @@ def test_nothing_varies_by_default():
 
 
 @pytest.mark.parametrize("delay", [0, 1, 3])
+@pytest.mark.integration
 def test_commands_come_late(delay):
     """A delayed vehicle does what one without a delay has done before."""
     env, params = varied(RandomizationConfig(delay=(delay, delay)))

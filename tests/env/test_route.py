@@ -82,6 +82,7 @@ def test_ways_lead_round_obstacles_unless_they_are_low():
     np.testing.assert_array_equal(to(EAST, unused).cost, to(EAST, ground()).cost)
 
 
+@pytest.mark.integration
 def test_costs_are_those_of_the_cheapest_way():
     """Dijkstra's algorithm finds the same, over moves whose costs are computed one by one."""
     cells, terrain = 12, ground(hills())

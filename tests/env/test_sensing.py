@@ -40,6 +40,7 @@ def stepped(at):
     return ground(hills() + 2.0 * (np.arange(129) - 64 >= at).astype(np.float32))
 
 
+@pytest.mark.integration
 def test_what_was_not_seen_is_neither_observed_nor_missed():
     """A step in the ground is observed once it is in range, and changes nothing before."""
     env, params = bicycle_env(ground(hills()), TASK, REVEALED)
@@ -66,6 +67,7 @@ def test_the_vehicle_follows_the_true_ground():
     chex.assert_trees_all_equal(hidden.vehicle, known.vehicle)
 
 
+@pytest.mark.integration
 def test_sensors_that_see_everything_show_what_a_known_map_shows():
     everything = NavigationConfig(sensing=SensingConfig(range=200.0))
     rocks = [[9.0, 2.0, 4.0, 4.0, 2.0]]
@@ -100,6 +102,7 @@ def test_a_wall_is_seen_when_it_comes_into_range():
     chex.assert_trees_all_equal(first, last)
 
 
+@pytest.mark.integration
 def test_many_are_stepped_in_one_program_and_begin_anew_with_what_they_see_there():
     config = replace(REVEALED, horizon_seconds=0.5)
     terrain = ground(hills())

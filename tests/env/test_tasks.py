@@ -56,6 +56,7 @@ def test_sway_turns_starts_to_level_ground():
     assert (slopes[1] < 0.01).tolist() == [True, False, False, True]
 
 
+@pytest.mark.integration
 def test_random_tasks_are_acceptable_and_varied():
     relief = hills(height=4.0)
     blocks = np.array([[x, y, 6, 6, 3] for x in (-30, 0, 30) for y in (-30, 0, 30)])

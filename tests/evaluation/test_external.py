@@ -22,6 +22,7 @@ from vertiwm_jax.terrain import map as terrain_map
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.integration
 def test_the_built_in_simulator_outside_jit_is_that_inside(jobs):
     semantic = np.full((16, 16), SNOW)
     semantic[:, 8:] = 0

@@ -35,6 +35,7 @@ def straight(short):
     return run_episodes(*short, StraightToGoal(CONFIG), jax.random.key(0))
 
 
+@pytest.mark.integration
 def test_agrees_with_a_loop_over_episodes(short, straight):
     env, params = short
     step, policy = jax.jit(env.step_env), StraightToGoal(CONFIG)
@@ -81,6 +82,7 @@ decided = []
 
 
 @pytest.mark.parametrize("together", [1, 4, 100])
+@pytest.mark.integration
 def test_decides_for_each_that_drives_as_if_it_were_alone(short, together, monkeypatch):
     monkeypatch.setattr(machine, "together", lambda **_: together)
     jax.clear_caches()  # Or what was compiled for others together would be found.

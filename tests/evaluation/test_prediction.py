@@ -197,6 +197,7 @@ def test_error_is_found_where_it_is():
     assert error_sources.format_shares(shares).count("\n") == len(shares) + 1
 
 
+@pytest.mark.integration
 def test_the_built_in_simulator_beats_both_baselines_on_chrono_drives():
     drives, terrain = dataset.load_drives(DRIVES, "train")
     test = TestWindows.of(drives, terrain, context=16, horizon=16, stride=16)

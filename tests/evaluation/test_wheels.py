@@ -42,6 +42,7 @@ def simulated(test):
     return compared(test, *load_model("builtin"))
 
 
+@pytest.mark.integration
 def test_wheels_of_the_simulator_go_with_those_recorded(test, simulated):
     sinkage, speed, force = simulated
     assert (sinkage.quantity, speed.quantity, force.quantity) == (
@@ -56,6 +57,7 @@ def test_wheels_of_the_simulator_go_with_those_recorded(test, simulated):
     assert table.count("\n") == 4 and f"| {sinkage.error:.3g} |" in table
 
 
+@pytest.mark.integration
 def test_every_model_with_physics_tells_of_its_wheels_and_others_do_not(test, simulated):
     config = ModelConfig()
     params = with_soil(config.init_params(jax.random.key(0), load_model("builtin")[1]), None)
@@ -73,6 +75,7 @@ def test_every_model_with_physics_tells_of_its_wheels_and_others_do_not(test, si
     assert compared(test, ConstantVelocity(), None) == []
 
 
+@pytest.mark.integration
 def test_what_was_not_recorded_is_not_compared(test, simulated):
     speed = test.windows.wheels.wheel_omega
     some = replace(test, windows=test.windows.replace(wheels=WheelSignals(wheel_omega=speed)))

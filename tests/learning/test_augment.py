@@ -146,6 +146,7 @@ def test_some_are_mirrored_and_the_others_left_alone(both):
     np.testing.assert_array_equal(some.control[:, 0, 1], np.where(mirrored, -1, 1))
 
 
+@pytest.mark.integration
 def test_the_simulator_drives_the_mirror_image_of_what_it_drives():
     drives, terrain = dataset.load_drives(DRIVES, "train")
     windows = gather(drives, index(drives, terrain, context=C, horizon=16, stride=20))

@@ -80,6 +80,7 @@ def test_errors_are_in_metres_and_pixels(data, params, monkeypatch):
     assert float(found["colour_accuracy"]) == pytest.approx(np.mean(right), abs=1e-4)
 
 
+@pytest.mark.integration
 def test_training_reconstructs_better_and_gives_encoders(data, params, tmp_path):
     config = FitConfig(updates=40, updates_per_iteration=20, learning_rate=3e-3, warm_up=5)
     problem, run = AutoencoderProblem(CONFIG), Run.create(tmp_path, "autoencoders", config)

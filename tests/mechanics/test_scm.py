@@ -143,6 +143,7 @@ def test_shear_stays_inside_the_cone_of_friction_and_opposes_the_slip():
     assert pushing.any() and np.all(np.asarray(f.longitudinal)[pushing] < 0)
 
 
+@pytest.mark.integration
 def test_a_wheel_without_torque_is_braked_most_by_the_softest_soil():
     omega = np.linspace(0, 3, 601) / WHEEL.radius
     drag = []

@@ -122,6 +122,7 @@ def energy(state: VehicleState) -> np.ndarray:
     return 0.5 * float(VEHICLE.mass) * (velocity**2).sum(-1) + 0.5 * spin + WEIGHT * height
 
 
+@pytest.mark.integration
 def test_settles_on_flat_ground_under_its_weight():
     flat = ground()
     driven = drive(flat, at_rest(flat))
@@ -254,6 +255,7 @@ def test_left_and_right_are_the_same():
     np.testing.assert_allclose(one.vector, other.vector * flip, atol=0.02)
 
 
+@pytest.mark.integration
 def test_every_wheel_may_be_of_its_own():
     names = ("wheel_radius", "wheel_width", "wheel_inertia", "wheel_torque", "brake_torque")
     own = {name: jnp.broadcast_to(getattr(VEHICLE, name), 4) for name in names}
@@ -388,6 +390,7 @@ def test_gradients_agree_with_differences(final, kind):
         assert float(gradient) == pytest.approx(difference, rel=0.1, abs=3e-3), name
 
 
+@pytest.mark.integration
 def test_derivatives_along_a_direction_agree_with_differences():
     """Forward mode, which compiles fast; the full gradients are tested with `-m slow`."""
     terrain = {kind: ground(lambda x, y: 0.05 * x, kind) for kind in (CONCRETE, SNOW)}
@@ -452,6 +455,7 @@ def test_a_batch_is_a_loop_and_commands_do_not_retrace():
         np.testing.assert_allclose(together.position[i], alone.state.position, atol=0.01)
 
 
+@pytest.mark.integration
 def test_few_substeps_are_enough():
     terrain = ground(lambda x, y: 0.3 * waves(x, y), MUD)
     state = at_rest(terrain)

@@ -125,6 +125,7 @@ def test_agrees_with_adaptive_quadrature():
         BekkerWongParams(reversal="rankine", bulldozing="wong"),
     ],
 )
+@pytest.mark.integration
 def test_values_and_gradients_are_finite_in_every_corner(contact):
     corners = itertools.product(
         range(3),
@@ -152,6 +153,7 @@ def test_values_and_gradients_are_finite_in_every_corner(contact):
     assert all(not np.any(x[airborne]) for x in gradient[3:])
 
 
+@pytest.mark.integration
 def test_gradients_agree_with_differences():
     soil = jax.tree.map(lambda x: x[0], SOILS)
     state = np.array([[0.03, 4.0, 0.5, 10.0], [0.03, 4.0, -0.5, 7.0], [0.05, 2.0, 0.3, 8.0]])

@@ -43,6 +43,7 @@ def mean_error(name, windows):
     return errors["position"][:, -1].mean()
 
 
+@pytest.mark.integration
 def test_it_predicts_better_than_what_it_is_made_of(windows):
     error = {name: mean_error(name, windows) for name in ("vertiwm", "nesam", "builtin")}
     assert error["nesam"] < 0.7 * error["builtin"]

@@ -31,6 +31,7 @@ def drive(model, params, states):
 
 
 @pytest.mark.parametrize("name", ["vertiwm", "transformer"])
+@pytest.mark.integration
 def test_a_model_that_keeps_latents_drives_alike(name):
     expected, found = (drive(*load_model(name, embeddings=kept), STATES) for kept in (False, True))
     np.testing.assert_allclose(found.vector, expected.vector, atol=1e-3)
@@ -49,6 +50,7 @@ def test_embeddings_are_kept_where_they_are_asked_for():
 
 
 @pytest.mark.parametrize("name", LEARNED)
+@pytest.mark.integration
 def test_matrices_are_those_of_the_transformers_alone(name):
     (model, params), (_, half) = (
         load_model(name, compute_dtype=dtype) for dtype in ("float32", "bfloat16")
@@ -68,6 +70,7 @@ def test_matrices_are_those_of_the_transformers_alone(name):
     chex.assert_trees_all_equal(cast_weights(params, "float32"), params)
 
 
+@pytest.mark.integration
 def test_commands_move_what_has_rounded_matrices():
     """As planners by gradients need it."""
 
@@ -105,6 +108,7 @@ def filled(leaf):
 
 @pytest.mark.parametrize("encoders", ["own", "shared"])
 @pytest.mark.parametrize("terrain", ["patches", "indicator"])
+@pytest.mark.integration
 def test_what_was_saved_is_loaded_by_its_parts(tmp_path, encoders, terrain):
     parts = ("transformer", "nesam") if terrain != "patches" else ("transformer", "nesam", "gate")
     config = ModelConfig(parts, terrain=terrain, encoders=encoders)

@@ -122,6 +122,7 @@ def test_every_weight_learns(channels):
     assert all(bool(jnp.all(g != 0)) for g in jax.tree.leaves(gradient))
 
 
+@pytest.mark.integration
 def test_training_improves_on_the_cosine_transform():
     model, axis = TerrainAutoencoder(1), jnp.arange(128)
 

@@ -101,6 +101,7 @@ def test_near_and_beyond_the_edge_of_coarse_and_fine_maps(kind, pose):
 @pytest.mark.parametrize("latents", [False, True])
 @pytest.mark.parametrize("pairs", PAIRS)
 @pytest.mark.parametrize("batch", [(1,), (5,), (37,), (2, 3)])
+@pytest.mark.integration
 def test_batches_are_those_of_one_at_a_time(batch, pairs, latents):
     """Vehicles look in turns, and cells with borders are drawn together."""
     terrain = terrain_map.stack([world(seed=seed) for seed in range(3)])
@@ -148,6 +149,7 @@ def test_a_map_of_which_a_part_is_known():
     assert np.abs(other[0].average - found[0].average).max() > 0.1
 
 
+@pytest.mark.integration
 def test_several_models_and_several_maps():
     states = places(2)
     models = jax.tree.map(lambda x: jnp.stack([x, 1.3 * x]), PAIRS["own"])

@@ -53,6 +53,7 @@ def planner(env, correction=(0.0, 0.0), value=0.0, base=True, **config):
     )
 
 
+@pytest.mark.integration
 def test_without_alternatives_it_drives_as_the_policy_does(blocked):
     env, params = blocked
     for correction in ((0.0, 0.0), (0.1, 0.2)):
@@ -75,6 +76,7 @@ def test_it_drives_around_what_its_policy_runs_into(blocked):
     assert ending(candidates=16, decisions=4) == TerminationReason.GOAL
 
 
+@pytest.mark.integration
 def test_a_future_is_worth_its_rewards_and_what_is_expected_at_its_end(blocked):
     env, params = blocked
     driver = planner(env, correction=(0.1, -0.3), value=7.0, decisions=3)
@@ -93,6 +95,7 @@ def test_a_future_is_worth_its_rewards_and_what_is_expected_at_its_end(blocked):
 
 
 @pytest.mark.parametrize("ending", [TerminationReason.COLLIDED, TerminationReason.TIMED_OUT])
+@pytest.mark.integration
 def test_nothing_is_expected_after_the_end(blocked, ending):
     env, params = blocked
     now = begin(env, params)
@@ -113,6 +116,7 @@ def test_nothing_is_expected_after_the_end(blocked, ending):
     assert returns[0] == returns[1]
 
 
+@pytest.mark.integration
 def test_its_model_follows_the_vehicle():
     """A planner that imagines in what really happens knows what only the simulator remembers."""
     simulator, params = Simulator(substeps=2), chrono_like(hmmwv())

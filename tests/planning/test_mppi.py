@@ -54,6 +54,7 @@ def decided(env, params, driver, start=0, corrections=None):
     return jax.jit(driver.plan)(now, memory, KEY).corrections
 
 
+@pytest.mark.integration
 def test_it_drives_around_what_driving_straight_runs_into(blocked):
     env, params = blocked
     straight = run_episodes(env, params, StraightToGoal(CONFIG), KEY)
@@ -62,6 +63,7 @@ def test_it_drives_around_what_driving_straight_runs_into(blocked):
     assert (found.ending == TerminationReason.GOAL).all()
 
 
+@pytest.mark.integration
 def test_it_plans_in_what_it_has_seen_of_the_map():
     """What stands out of range changes no plan, and what comes into range is driven around."""
     seeing = replace(CONFIG, sensing=SensingConfig(range=12.0))
@@ -78,6 +80,7 @@ def test_it_plans_in_what_it_has_seen_of_the_map():
     assert (found.ending == TerminationReason.GOAL).all()
 
 
+@pytest.mark.integration
 def test_the_model_follows_the_vehicle():
     """Whoever steers against the pull has to know how strong it has become."""
     env = NavigationEnv(Pulling(), replace(CONFIG, settle_steps=0))
@@ -102,6 +105,7 @@ def test_a_plan_without_alternatives_is_kept_and_moves_on(blocked):
 
 
 @pytest.mark.parametrize("temperature", [1e-3, 100.0, 1e9])
+@pytest.mark.integration
 def test_plans_count_by_what_they_return(blocked, temperature):
     env, params = blocked
     planner = driver(env, temperature=temperature)
@@ -135,6 +139,7 @@ def test_after_a_plan_it_goes_on_to_the_goal_at_a_steady_pace(blocked):
     )
 
 
+@pytest.mark.integration
 def test_many_decide_as_each_alone(blocked):
     env, params = blocked
     planner = driver(env)

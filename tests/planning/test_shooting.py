@@ -55,12 +55,14 @@ def drawn(number, decisions=4, key=KEY):
     return jax.random.uniform(key, (number, decisions, 2), minval=-0.8, maxval=0.8)
 
 
+@pytest.mark.integration
 def test_it_drives_around_what_driving_straight_runs_into(blocked):
     env, params = blocked
     found = run_episodes(env, params, driver(env), KEY)
     assert (found.ending == TerminationReason.GOAL).all()
 
 
+@pytest.mark.integration
 def test_the_gradient_is_that_of_finite_differences(hilly):
     env, params = hilly
     planner = driver(env)
@@ -74,6 +76,7 @@ def test_the_gradient_is_that_of_finite_differences(hilly):
         assert float(found[place]) == pytest.approx(difference, rel=0.03, abs=2.0)
 
 
+@pytest.mark.integration
 def test_steps_improve_what_a_plan_returns_smoothly(hilly):
     env, params = hilly
     planner = driver(env, steps=4, rate=0.05)
@@ -88,6 +91,7 @@ def test_steps_improve_what_a_plan_returns_smoothly(hilly):
         plans = better
 
 
+@pytest.mark.integration
 def test_a_step_turns_a_plan_away_from_a_rock_that_it_passes_too_near():
     """To the goal the vehicle has only to go straight on; a rock stands a little to its right."""
     terrain = ground(obstacles=[[-10.0, -2.2, 2.0, 2.0, 2.0]])
@@ -105,6 +109,7 @@ def test_a_step_turns_a_plan_away_from_a_rock_that_it_passes_too_near():
 
 
 @pytest.mark.parametrize("speed", [0.3, 1.0])
+@pytest.mark.integration
 def test_a_sharp_smooth_return_is_the_task_s(blocked, speed):
     """At 1 the plan runs into the wall, at 0.3 it stops short of it."""
     env, params = blocked
@@ -117,6 +122,7 @@ def test_a_sharp_smooth_return_is_the_task_s(blocked, speed):
     assert float(found) == pytest.approx(float(expected), rel=2e-3)
 
 
+@pytest.mark.integration
 def test_what_it_intends_is_worth_more_than_any_plan_it_drew(blocked):
     env, params = blocked
     planner = driver(env)
@@ -128,6 +134,7 @@ def test_what_it_intends_is_worth_more_than_any_plan_it_drew(blocked):
     assert float(worth[-1]) > float(worth[:-1].max()) + 1.0
 
 
+@pytest.mark.integration
 def test_a_plan_without_alternatives_is_kept_and_moves_on(blocked):
     env, params = blocked
     plan = jnp.array([[0.1, 0.2], [0.3, -0.4], [0.5, 0.6], [-0.7, 0.8]])
@@ -137,6 +144,7 @@ def test_a_plan_without_alternatives_is_kept_and_moves_on(blocked):
     np.testing.assert_allclose(found, plan[jnp.array([1, 2, 3, 3])], rtol=1e-6)
 
 
+@pytest.mark.integration
 def test_a_gradient_that_is_not_finite_leaves_its_plan_and_no_other():
     env = NavigationEnv(Broken(), replace(CONFIG, settle_steps=0))
     params = env.make_params(BICYCLE, ground(), task((-20.0, 0.0), (20.0, 0.0)))
@@ -148,6 +156,7 @@ def test_a_gradient_that_is_not_finite_leaves_its_plan_and_no_other():
     np.testing.assert_array_equal(found[1], plans[1])
 
 
+@pytest.mark.integration
 def test_it_compiles_once(blocked):
     env, params = blocked
     planner, traces = driver(env), []

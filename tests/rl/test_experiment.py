@@ -16,6 +16,7 @@ from vertiwm_jax.terrain.classes import STANDARD
 GROUND = GroundConfig(suites=("easy",), suite_worlds=1, pairs=2)
 
 
+@pytest.mark.integration
 def test_a_rover_is_tested_on_soil_of_its_scale():
     known, rover = (TaskConfig(vehicle=name, ground=GROUND) for name in ("hmmwv", "rover"))
     ground, small = experiment.held_out(known), experiment.held_out(rover)

@@ -68,12 +68,14 @@ def values(algorithm, state, *observations):
 
 
 @each
+@pytest.mark.integration
 def test_value_depends_on_the_observation(name):
     sign = algorithm(name, Sign(), normalize_observations=True, normalize_rewards=True)
     np.testing.assert_allclose(values(sign, train(sign)[0], -1.0, 1.0), [-1, 1], atol=0.1)
 
 
 @each
+@pytest.mark.integration
 def test_delayed_reward_is_discounted(name):
     # The entropy that is to come is a part of SAC's values: here it is next to nothing.
     quiet = {"initial_temperature": 1e-9, "target_entropy": -20.0} if name == "sac" else {}
@@ -85,6 +87,7 @@ def test_delayed_reward_is_discounted(name):
 
 
 @each
+@pytest.mark.integration
 def test_truncation_is_bootstrapped(name):
     quiet = {"initial_temperature": 1e-9, "target_entropy": -20.0} if name == "sac" else {}
     endless = algorithm(name, Endless(), tau=0.2, transitions=8192, **quiet)
@@ -94,6 +97,7 @@ def test_truncation_is_bootstrapped(name):
 
 
 @each
+@pytest.mark.integration
 def test_policy_finds_the_action_that_depends_on_the_observation(name):
     target = algorithm(name, **TARGET)
     state, metrics = train(target)
@@ -106,6 +110,7 @@ def test_policy_finds_the_action_that_depends_on_the_observation(name):
 
 
 @each
+@pytest.mark.integration
 def test_a_penalty_keeps_actions_small_unless_more_are_worth_it(name):
     target, observations = (
         algorithm(name, **TARGET, action_penalty=100.0),
@@ -116,6 +121,7 @@ def test_a_penalty_keeps_actions_small_unless_more_are_worth_it(name):
 
 
 @each
+@pytest.mark.integration
 def test_nothing_is_learned_while_warming_up(name):
     target = algorithm(name, **TARGET)
     first = compiled(target)[0](ProbeParams(), jax.random.key(0)).learner
@@ -132,6 +138,7 @@ def test_nothing_is_learned_while_warming_up(name):
 
 
 @each
+@pytest.mark.integration
 def test_an_average_of_the_actor_drives(name):
     single = {"policy_delay": 1} if name == "td3" else {}
     target = algorithm(name, **TARGET, updates=1, tau=0.25, **single)

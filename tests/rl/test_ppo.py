@@ -95,6 +95,7 @@ def test_policy_finds_the_action_that_depends_on_the_observation(normalise):
     np.testing.assert_allclose(actions[:, 0], [-1 / 3, 1 / 3], atol=0.05)
 
 
+@pytest.mark.integration
 def test_truncation_is_bootstrapped_and_termination_is_not():
     endless = PPO(Endless(), CONFIG)
     state, metrics = train(endless, ProbeParams(max_steps_in_episode=5))
@@ -154,6 +155,7 @@ def test_minibatches_and_their_parts_must_divide_the_steps(minibatches, parts):
         PPOConfig(num_envs=4, num_steps=16, minibatches=minibatches, grad_accumulation=parts)
 
 
+@pytest.mark.integration
 def test_an_epoch_learns_from_every_transition_once():
     def mean_loss(minibatches):
         config = PPOConfig(**{**vars(CONFIG), "learning_rate": 1e-12, "minibatches": minibatches})

@@ -102,6 +102,7 @@ def change(x=0.0, z=0.0, roll=0.0):
         (5, None, Reason.TIMED_OUT),
     ],
 )
+@pytest.mark.integration
 def test_episodes_outside_jit_are_those_inside(both, number, action, ending):
     inside, outside = both(number)
     (expected, _), (found, _) = inside.reset(seed=0), outside.reset(seed=0)

@@ -53,6 +53,7 @@ def drive(simulator, start, commands):
 
 
 @pytest.mark.parametrize("kind", SIMULATORS)
+@pytest.mark.integration
 def test_a_start_is_at_rest(kind):
     seen = kind(ground(slope=0.1)).start(150.0, 5.0, 1.0)
     slope, creep = np.arctan(0.1), CREEP[kind]
@@ -106,6 +107,7 @@ def test_a_start_forgets_the_drive_before(kind):
     jax.tree.map(np.testing.assert_array_equal, first, again)
 
 
+@pytest.mark.integration
 def test_the_built_in_simulator_is_the_one_inside_jit():
     terrain, model, params = ground(slope=0.1, east=SAND), Simulator(), chrono_like(hmmwv())
     commands = np.random.default_rng(0).uniform([1, -0.3], [4, 0.3], (40, 2)).astype(np.float32)

@@ -4,6 +4,7 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from world_model.examples import (
     CONSTANTS,
     TINY,
@@ -107,6 +108,7 @@ def test_it_sees_nothing_where_soils_are_those_of_the_map():
     assert jax.jit(MODEL.init)(PARAMS, TERRAIN, standing()).features == ()
 
 
+@pytest.mark.integration
 def test_untrained_is_the_simulator():
     state, control = standing(), commands(16)
     expected = predicted(Simulator(), PHYSICS, state, control)
@@ -186,6 +188,7 @@ def test_a_mirrored_vehicle_on_mirrored_ground_drives_mirrored():
     assert float(jnp.abs(drive.position - alone.position)[-1].max()) > 0.02
 
 
+@pytest.mark.integration
 def test_gradients_reach_all_weights_through_sixteen_steps():
     own = replace(PARAMS.nesam, response=-0.4 * jnp.eye(12, 6, -6))
     state, control = standing(3), commands(16)
@@ -200,6 +203,7 @@ def test_gradients_reach_all_weights_through_sixteen_steps():
         assert float(jnp.abs(leaf).max()) > 0, path
 
 
+@pytest.mark.integration
 def test_calibration_measures_what_physics_misses_and_how_it_answers():
     drives, steps = 6, 16
     starts, control = standing(5, drives), commands(steps, drives)
@@ -222,6 +226,7 @@ def test_calibration_measures_what_physics_misses_and_how_it_answers():
     np.testing.assert_allclose(found[9:], 0, atol=1e-4)
 
 
+@pytest.mark.integration
 def test_the_mean_gradient_is_exact_where_physics_answers_alike_everywhere():
     change = jnp.diag(KEEPS - 1)
     own = replace(PARAMS.nesam, response=jnp.concatenate([-0.02 * change, change]))
@@ -239,6 +244,7 @@ def test_the_mean_gradient_is_exact_where_physics_answers_alike_everywhere():
         np.testing.assert_allclose(a, b, atol=2e-2 * float(jnp.abs(b).max()))
 
 
+@pytest.mark.integration
 def test_a_batch_is_a_loop_and_one_trace_serves_all_drives():
     check_batches(partial(predict, SIMPLE, PARAMS), standing(2, 3), commands(16, 3), 1e-3)
 
@@ -253,6 +259,7 @@ def test_jit_changes_nothing():
         np.testing.assert_allclose(a, b, atol=1e-4)
 
 
+@pytest.mark.integration
 def test_predicted_soils_are_those_of_the_predictor_wherever_it_drives():
     """Against a map whose every soil is what the predictor says of the latents."""
     state, command = standing(), one(commands(1), 0)
@@ -271,6 +278,7 @@ def test_predicted_soils_are_those_of_the_predictor_wherever_it_drives():
     assert float(jnp.abs(found - other).max()) > 1e-5
 
 
+@pytest.mark.integration
 def test_exact_gradients_let_commands_move_what_the_mean_gradient_holds():
     history = SIMPLE.init(UNTRAINED, TERRAIN, driving())
     command = Command(jnp.float32(2), jnp.float32(0.1))

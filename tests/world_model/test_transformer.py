@@ -213,6 +213,7 @@ def test_encoders_and_constants_never_learn():
     assert all(bool(np.any(x)) for x in jax.tree.leaves(learns))
 
 
+@pytest.mark.integration
 def test_the_first_layer_learns_only_from_latents():
     def away(encoders, commands, model):
         params, state = replace(PARAMS["patches"], encoders=encoders), driving()
@@ -229,6 +230,7 @@ def test_the_first_layer_learns_only_from_latents():
         jax.grad(away)(encoders, control, MODEL)
 
 
+@pytest.mark.integration
 def test_gradients_through_a_warmed_up_rollout_are_finite():
     drive, before, after = driving(6, 9), commands(8), commands(16, seed=2)
 

@@ -312,6 +312,7 @@ def test_proposals_reach_the_fused_state_but_not_the_gate_with_gradients():
     assert moves == [[True, False], [True, True], [False, False]]
 
 
+@pytest.mark.integration
 def test_gate_learns_through_time_with_finite_gradients():
     """Sixteen steps, through the fused states as well as the gate's memory."""
     history, control = init(PARAMS, TERRAIN, STATE), commands(16, seed=2)
