@@ -197,12 +197,26 @@ class _Pipeline:
             ("single_steps", TeacherForcingLoss(alone, deviation), config.single_steps),
             ("rollouts", RolloutLoss(alone, self.config.loss), config.rollouts),
         ]
+        # A stage holds what is its specialist's alone, so that other runs may take it over.
+        at = 0 if name == "transformer" else len(params.encoders) - 1
+        encoders = params.encoders[at : at + 1]
+        if name == "transformer":
+            encoders = tuple(replace(pair, soil=None) for pair in encoders)
+        others = {"transformer": None, "nesam": None, "gate": None}
+        fitted = replace(params, **{**others, name: own}, encoders=encoders)
         data, digest = self._windows(kinds), ""
         for part, objective, schedule in parts if self.start is None else parts[1:]:
+            if not sees:
+                trainable = [each for each in schedule.trainable if not each.startswith("encoders")]
+                schedule = replace(schedule, trainable=tuple(trainable))
             problem = WindowProblem(alone, objective, self.config.windows)
             stage = f"{name}_{part}", problem, schedule, kinds
-            params, digest = self._fit(*stage, params, data, before)
+            fitted, digest = self._fit(*stage, fitted, data, before)
             before = (digest,)
+        pairs = zip(fitted.encoders, params.encoders[at : at + 1], strict=True)
+        learned = [replace(pair, soil=pair.soil or old.soil) for pair, old in pairs]
+        encoders = (*params.encoders[:at], *learned, *params.encoders[at + 1 :])
+        params = replace(params, **{name: getattr(fitted, name)}, encoders=encoders)
         return with_soil(params, soil), digest
 
     def _encoders(
