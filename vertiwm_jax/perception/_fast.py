@@ -8,7 +8,7 @@ need not be drawn. Vehicles look in turns of about 16, whose patches stay near a
 """
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cache, partial
 from typing import Any, cast
 
@@ -54,18 +54,18 @@ class _Vehicles:
 
     def on(self, terrain: TerrainMap) -> TerrainMap:
         """The map as one of them, leaves `[...]`, has it."""
-        return terrain.replace(world=self.world, observed=self.observed)  # type: ignore[attr-defined]
+        return replace(terrain, world=self.world, observed=self.observed)
 
 
 def look(
     encoders: tuple[Encoders, ...], terrain: TerrainMap, state: VehicleState, latents: bool
 ) -> tuple[TerrainFeatures, ...]:
     """What `perceive` gives for one vehicle, to rounding."""
-    seen = {field.name: None for field in fields(TerrainMap)}
-    seen |= {name: getattr(terrain, name) for name in _SEEN}
+    hidden = {field.name: None for field in fields(TerrainMap) if field.name not in _SEEN}
+    seen = replace(terrain, **hidden)
     vehicle = _Vehicles(terrain.world, terrain.observed, state.position, state.rpy[2])
     alone = jax.tree.map(lambda x: x[None], vehicle)
-    found = _batched(latents)((encoders, TerrainMap(**seen)), alone)  # type: ignore[arg-type]
+    found = _batched(latents)((encoders, seen), alone)
     return jax.tree.map(lambda x: x[0], found)
 
 
