@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -56,9 +57,10 @@ def files(
     encoders: of a policy that sees embeddings; config, vehicle, held: as in `description.about`;
     record: `onnx_graph.record`.
     """
-    about, weights = description.about(policy, config, vehicle, held), description.weights(policy)
+    about = description.about(policy, config, vehicle, held)
+    weights: dict[str, Any] = dict(description.weights(policy))
     arrays = io.BytesIO()
-    np.savez(arrays, allow_pickle=False, **weights)
+    np.savez(arrays, **weights)
     size = about["observation"]["size"]
     return {
         "policy.json": json.dumps(about, indent=1) + "\n",

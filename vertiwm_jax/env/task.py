@@ -41,7 +41,7 @@ class NavigationConfig:
     sensing: what sensors see of a map that is unknown at first; by default all of it is known.
     """
 
-    GONE: ClassVar = {
+    GONE: ClassVar[dict[str, str]] = {
         "chassis": "is gone; the sizes are those of the vehicle, see `vehicle`",
         "reveal": "is now sensing",
     }

@@ -50,7 +50,7 @@ class Problem(Protocol):
 class FitConfig:
     """How parameters are fitted."""
 
-    GONE: ClassVar = {"accumulate": "is now grad_accumulation"}
+    GONE: ClassVar[dict[str, str]] = {"accumulate": "is now grad_accumulation"}
 
     updates: CountOrZero = 10_000
     """Optimiser steps (AdamW), each on a batch, or batches, of its own; 0 leaves the stage out."""

@@ -120,7 +120,8 @@ def write(
     vehicle = {"wheels_in_body_xy": np.asarray(wheels).tolist()}
     text = json.dumps({**meta, "dt": STEP_SECONDS, "vehicle": vehicle})
     stream = io.BytesIO()
-    np.savez_compressed(stream, allow_pickle=False, meta=np.array(text), **arrays)
+    stored: dict[str, Any] = {**arrays, "meta": np.array(text)}
+    np.savez_compressed(stream, **stored)
     atomic.write(path, stream.getvalue())
 
 

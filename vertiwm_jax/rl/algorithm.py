@@ -17,7 +17,7 @@ State = TypeVar("State")
 class LearningConfig:
     """How much is experienced, and what networks learn from it."""
 
-    GONE: ClassVar = {
+    GONE: ClassVar[dict[str, str]] = {
         "normalise_observations": "is now normalize_observations",
         "normalise_rewards": "is now normalize_rewards",
     }

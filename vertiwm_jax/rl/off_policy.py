@@ -38,7 +38,7 @@ Params = Any
 class OffPolicyConfig(LearningConfig):
     """Settings of an algorithm with a replay buffer; its learning rate is constant."""
 
-    GONE: ClassVar = LearningConfig.GONE | {
+    GONE: ClassVar[dict[str, str]] = LearningConfig.GONE | {
         "capacity": "is now buffer_size",
         "warm_up": "is now learning_starts",
         "target_rate": "is now tau",

@@ -121,7 +121,7 @@ def save(
     `WriteError` where that is not possible.
     """
     folder.mkdir(exist_ok=True)
-    arrays = {
+    arrays: dict[str, Any] = {
         **_named("actor", policy.params),
         **_named("critic", value.params),
         "observation_mean": policy.observations.mean,
@@ -130,7 +130,7 @@ def save(
         "return_scale": value.scale,
     }
     stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **jax.device_get(arrays))
+    np.savez(stream, **jax.device_get(arrays))
     atomic.write(folder / "policy.yaml", configuration.dump(config))
     atomic.write(folder / "weights.npz", stream.getvalue())
 

@@ -38,7 +38,7 @@ _BY_ENVIRONMENT = PartitionSpec(None, BATCH)
 class PPOConfig(LearningConfig):
     """Settings of PPO; the defaults suit the navigation task on the built-in simulator."""
 
-    GONE: ClassVar = LearningConfig.GONE | {
+    GONE: ClassVar[dict[str, str]] = LearningConfig.GONE | {
         "accumulate": "is now grad_accumulation",
         "trace": "is now gae_lambda",
         "clip": "is now clip_eps",

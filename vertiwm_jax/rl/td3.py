@@ -18,7 +18,7 @@ from vertiwm_jax.rl.off_policy import Learner, OffPolicy, OffPolicyConfig, Param
 class TD3Config(OffPolicyConfig):
     """Settings of TD3."""
 
-    GONE: ClassVar = OffPolicyConfig.GONE | {
+    GONE: ClassVar[dict[str, str]] = OffPolicyConfig.GONE | {
         "exploration": "is now exploration_noise",
         "smoothing": "is now target_noise",
         "largest_smoothing": "is now target_noise_clip",
