@@ -263,7 +263,7 @@ def trained(bench: Benchmark) -> Found:
             limit.cancel()
         found: Found = {"all_s": time.monotonic() - start, "said": said}
         for run in Path(folder).glob("ppo-*"):
-            if rates := runs.read_columns(run).get("transitions_per_second"):
+            if rates := runs.read_columns(run).get("timesteps_per_second"):
                 found["median_transitions_per_s"] = statistics.median(rates)
     error = {"error": f"ended with status {process.returncode}"} if process.returncode else {}
     return found | error
@@ -367,7 +367,7 @@ def sizes(small: bool) -> tuple[PPOTraining, Sequence[ModelName], Sequence[int],
         ground=GroundConfig(train_worlds=2, suites=("easy",), suite_worlds=1, starts=8, pairs=1),
         navigation=NavigationConfig(horizon_seconds=2, settle_steps=2),
         action_repeat=2,
-        ppo=replace(config.ppo, transitions=64, num_envs=8, num_steps=4, minibatches=2),
+        ppo=replace(config.ppo, total_timesteps=64, num_envs=8, num_steps=4, minibatches=2),
     )
     return tiny, ("builtin", "transformer"), (8,), (8, 16)
 

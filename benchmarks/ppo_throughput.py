@@ -55,7 +55,7 @@ class IdleEnv(environment.Environment):
         return spaces.Box(-1.0, 1.0, (2,))
 
 
-def iteration(ppo: PPO, params: Any, repeat: int = 1) -> Figures:
+def iteration(ppo: PPO, params: Any) -> Figures:
     """On as many devices as a training has, and on one of them, with all cores to itself."""
     algorithm, results = Seeds(ppo, 1), {}
     start = jax.jit(algorithm.init)(params, jax.random.key(0))
@@ -63,7 +63,7 @@ def iteration(ppo: PPO, params: Any, repeat: int = 1) -> Figures:
         whole, state = parallel.place(mesh, params), parallel.place(mesh, start, algorithm.specs)
         with jax.set_mesh(mesh):
             figures = measure(jax.jit(algorithm.iterate), whole, state, repeats=3)
-        rate = repeat * ppo.config.collected / figures["median_s"]
+        rate = ppo.timesteps / figures["median_s"]
         results |= {f"{name}transitions_per_s": rate}
         results |= figures | {"devices": mesh.size} if not name else {}
     return results
@@ -75,7 +75,7 @@ def of_task(name: str, model: ModelName, weights: Path | None, operands: Compute
     config = configuration.load(PPOTraining, file)
     config = replace(config, model=model, weights=weights, operands=operands)
     training, _ = experiment.training_environment(config)
-    return iteration(config.algorithm(training.env), training.params, config.action_repeat)
+    return iteration(config.algorithm(training.env), training.params)
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ def of_task(name: str, model: ModelName) -> Figures:
     soon = replace(getattr(config, name), learning_starts=config.schedule.num_envs)
     config = replace(config, model=model, **{name: soon})
     training, _ = experiment.training_environment(config)
-    return iteration(config.algorithm(training.env), training.params, config.action_repeat)
+    return iteration(config.algorithm(training.env), training.params)
 
 
 def main() -> None:

@@ -34,7 +34,12 @@ def test_what_goes_on_from_the_model_that_comes_along_is_of_its_form(name):
     assert settings.model == files.load(files.PRETRAINED)[0]
 
 
+@pytest.mark.parametrize("name", experiment.TRAININGS)
+def test_what_is_not_set_is_as_in_the_file_of_the_algorithm(name):
+    assert experiment.load(config.default_config(name)) == experiment.TRAININGS[name]()
+
+
 def test_the_papers_schedule_is_the_papers():
     training = config.load(PPOTraining, config.default_config("ppo_paper"))
-    assert training.ppo.iterations == 2_000 and training.ppo.collected == 20 * 300
+    assert training.ppo.total_timesteps == 2_000 * 20 * 300
     assert training.action_repeat == 1 and training.base == "none"

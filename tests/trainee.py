@@ -39,7 +39,7 @@ def trained(folder: Path, iterations: int) -> Path:
     seeds = Seeds(algorithm, settings.loop.seeds)
     restored = restore(seeds, data, resume) if resume else None
     with Run.begin(settings, "probe", restored[0] if restored else 0) as run:
-        key, work = jax.random.key(0), Work("transitions", CONFIG.collected, ())
+        key, work = jax.random.key(0), Work("timesteps", algorithm.timesteps, ())
         train(seeds, data, key, run, iterations, work, settings.loop, restored)
     return run.folder
 

@@ -30,13 +30,13 @@ def result(reached: int) -> NavigationResult:
 def test_costs_are_of_all_sessions_of_a_training(tmp_path):
     # Two iterations, then hours until it was resumed.
     lines = [
-        {"step": 1, "wall_time": 10.0, "transitions": 600, "transitions_per_second": 100.0},
-        {"step": 2, "wall_time": 16.0, "transitions": 1200, "transitions_per_second": 50.0},
-        {"step": 3, "wall_time": 9999.0, "transitions": 1800, "transitions_per_second": 200.0},
+        {"step": 1, "wall_time": 10.0, "timesteps": 600, "timesteps_per_second": 100.0},
+        {"step": 2, "wall_time": 16.0, "timesteps": 1200, "timesteps_per_second": 50.0},
+        {"step": 3, "wall_time": 9999.0, "timesteps": 1800, "timesteps_per_second": 200.0},
     ]
     (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
     cost = TrainingCost.of(tmp_path)
-    assert cost.seconds == pytest.approx(6 + 12 + 3) and cost.transitions == 1800
+    assert cost.seconds == pytest.approx(6 + 12 + 3) and cost.timesteps == 1800
 
 
 def test_every_simulator_has_a_table_of_all_policies():

@@ -30,8 +30,8 @@ def run(name: str, argv: Sequence[str], ends: Connection) -> None:
 def main(maps: str, output: str, seconds: float) -> None:
     jax.jit(jnp.sin)(jnp.zeros(3)).block_until_ready()
     commands = {
-        "collect": ["--output", output, "--worlds", maps, "--seconds", "0.1"],
-        "evaluate": ["navigation", "--policy", "straight", "--worlds", maps],
+        "collect": ["--output", output, "--terrain", maps, "--seconds", "0.1"],
+        "evaluate": ["navigation", "--policy", "straight", "--terrain", maps],
     }
     forking, waiting = multiprocessing.get_context("fork"), {}
     for name, argv in commands.items():

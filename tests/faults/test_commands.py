@@ -78,7 +78,7 @@ def test_an_unwritable_output_is_refused_first(tmp_path, monkeypatch, command):
         (evaluate.calibration, "signs"),
     ):
         monkeypatch.setattr(place, name, begin)
-    driven = {"navigation": ["--policy", "straight", "--worlds", maps(tmp_path / "large", 129)]}
+    driven = {"navigation": ["--policy", "straight", "--terrain", maps(tmp_path / "large", 129)]}
     data = driven.get(command, ["--data", tmp_path])
     message = refusal(door("evaluate"), command, *data, "--output", tmp_path / "file")
     assert str(tmp_path / "file") in message
@@ -95,7 +95,7 @@ SMALL = {
 def test_a_map_that_is_too_small_is_called_so(tmp_path, name):
     command, argv = SMALL[name]
     small = maps(tmp_path / "worlds", size=21, count=5)
-    message = refusal(command, *argv, "--worlds", small).removeprefix("error: ")
+    message = refusal(command, *argv, "--terrain", small).removeprefix("error: ")
     # Its name and its size, and not the coordinates of a task.
     assert message.startswith(str(small)) and "20" in message.removeprefix(str(small))
     assert "tasks." not in message

@@ -30,7 +30,7 @@ from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import worlds
 
-COLLECTED = {"transitions": 64, "num_envs": 8, "num_steps": 8, "hidden": (8,)}
+COLLECTED = {"total_timesteps": 64, "num_envs": 8, "num_steps": 8, "hidden": (8,)}
 REPLAYED = COLLECTED | {"updates": 1, "batch": 8, "buffer_size": 64, "learning_starts": 64}
 
 

@@ -25,6 +25,7 @@ from vertiwm_jax import cli, runs
 from vertiwm_jax import config as configuration
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.env.reward import RewardConfig
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.learning import pipeline, stages
@@ -66,17 +67,20 @@ STARTS = np.array(
     ]
 )
 STEPS = 16
+SPEEDS, REWARD = (0.0, 6.0), RewardConfig(stuck=300.0, failure=600.0)
 KEPT = np.array([0, 3, 7, 15])
 """Steps whose states are kept, of `STEPS`."""
 # As tests/integration/test_doors.py trains, where planning is a row more in the tests of policies.
 TRAINING = """
 ground: {train_worlds: 2, suites: [easy, obstacles], suite_worlds: 1, starts: 8, pairs: 2}
-navigation: {horizon_seconds: 3, settle_steps: 2}
+model: builtin
+navigation:
+  {horizon_seconds: 3, settle_steps: 2, speed_range: [0, 6], reward: {stuck: 300, failure: 600}}
 simulator: {substeps: 1}
 action_repeat: 2
 ppo:
-  {transitions: 256, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1, hidden: [8],
-   schedule: constant}
+  {total_timesteps: 512, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1, hidden: [8],
+   schedule: constant, discount: 0.99, initial_log_std: -0.5}
 loop: {checkpoint_every: 2}
 """
 PLANNING = "planning: {candidates: 2, decisions: 1, model: builtin}\n"
@@ -88,6 +92,7 @@ LEARNING = {
     "max_gradient_norm": 1.0,
     "hidden": (16,),
 }
+FIRST = {"initial_log_std": -0.5}
 REPLAYING = {"updates": 2, "batch": 32, "buffer_size": 1024, "learning_starts": 128, "tau": 0.05}
 
 
@@ -168,7 +173,9 @@ def sight() -> Numbers:
 def environment() -> Numbers:
     """Five steps of four tasks as policies see them, the ground by encoders too."""
     dynamics, weights = load_model("bicycle")
-    env = NavigationEnv(dynamics, NavigationConfig(embeddings=True))
+    env = NavigationEnv(
+        dynamics, NavigationConfig(speed_range=SPEEDS, reward=REWARD, embeddings=True)
+    )
     xy, yaw = (jnp.asarray(STARTS[::2, columns], jnp.float32) for columns in ([0, 1], 5))
     pool = Tasks(jnp.zeros(len(xy), jnp.int32), xy, yaw, goal=-xy)
     params = env.make_params(weights, ground(), pool, encoders=load_encoders())
@@ -273,10 +280,10 @@ def on_a_probe(name: str) -> Numbers:
     """What an algorithm has learned after three iterations of an environment of four steps."""
     env, params = Target(steps=4), ProbeParams()
     if name == "ppo":
-        config = PPOConfig(**LEARNING, epochs=4, minibatches=2, schedule="constant")
+        config = PPOConfig(**LEARNING, **FIRST, epochs=4, minibatches=2, schedule="constant")
         algorithm = PPO(env, config)
     elif name == "sac":
-        algorithm = SAC(env, SACConfig(**LEARNING, **REPLAYING))
+        algorithm = SAC(env, SACConfig(**LEARNING, **FIRST, **REPLAYING))
     else:
         algorithm = TD3(env, TD3Config(**LEARNING, **REPLAYING))
     state = jax.jit(algorithm.init)(params, jax.random.key(0))
@@ -310,7 +317,7 @@ def training(settings: str = TRAINING) -> Numbers:
         metrics = runs.read_metrics(run)[0]
         with (run / "episodes.csv").open() as lines:
             episodes = list(csv.DictReader(lines))
-    timed = "wall_time", "transitions_per_second"
+    timed = "wall_time", "timesteps_per_second"
     found = {f"metrics/{name}": x for name, x in metrics.items() if name not in timed}
     for column in episodes[0]:
         entries = [episode[column] for episode in episodes]

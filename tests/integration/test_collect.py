@@ -43,7 +43,7 @@ def maps(tmp_path_factory):
 
 
 def run(maps, output, *argv):
-    arguments = ["--output", output, "--worlds", maps, "--drives", 23, "--seconds", STEPS / 10]
+    arguments = ["--output", output, "--terrain", maps, "--drives", 23, "--seconds", STEPS / 10]
     door("collect")([*map(str, arguments), *argv])
 
 
@@ -114,20 +114,20 @@ def test_what_cannot_be_written_leaves_nothing_half_written(maps, tmp_path, monk
             write(path, data)
 
     monkeypatch.setattr(atomic, "write", write_on_a_full_disk)
-    argv = ("--output", run_folder, "--worlds", maps, "--drives", 1, "--seconds", 0.1)
+    argv = ("--output", run_folder, "--terrain", maps, "--drives", 1, "--seconds", 0.1)
     assert "No space left" in refusal(door("collect"), *argv)
     assert sorted(path.name for path in run_folder.iterdir()) == ["config.yaml", "maps"]
 
 
 def test_another_command_does_not_go_on(collected, maps, tmp_path):
-    argv = ("--output", collected, "--worlds", maps, "--seconds", STEPS / 10)
+    argv = ("--output", collected, "--terrain", maps, "--seconds", STEPS / 10)
     message = refusal(door("collect"), *argv, "--drives", 22)
     assert message.endswith("config.yaml: drives: expected 23 as before, found 22")
     (tmp_path / "file").touch()
-    message = refusal(door("collect"), "--output", tmp_path, "--worlds", maps)
+    message = refusal(door("collect"), "--output", tmp_path, "--terrain", maps)
     assert "expected a new folder" in message
     assert "none: file: expected" in refusal(
-        door("collect"), "--output", tmp_path, "--worlds", maps / "none"
+        door("collect"), "--output", tmp_path, "--terrain", maps / "none"
     )
     with pytest.raises(SystemExit) as stop:
         door("collect")(["--output", str(tmp_path), "--obstacles", "True"])
@@ -303,7 +303,7 @@ def test_a_rover_drives_at_full_size(maps, tmp_path):
     resting = rover.wheel_radius - rover.travel_at_rest.mean()
     np.testing.assert_allclose(drives.state[..., 2] - 3.0, resting, atol=0.15)
     message = refusal(
-        door("collect"), "--output", tmp_path / "drives", "--worlds", tmp_path / "maps"
+        door("collect"), "--output", tmp_path / "drives", "--terrain", tmp_path / "maps"
     )
     assert message.endswith("config.yaml: vehicle: expected rover as before, found hmmwv")
     for argv in (["--vehicle", "rovr"], ["--vehicle", "rover", "--simulator", "chrono"]):

@@ -17,7 +17,10 @@ navigation: {horizon_seconds: 2, settle_steps: 2}
 simulator: {substeps: 1}
 action_repeat: 2
 """
-PPO = "ppo: {transitions: 128, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1, hidden: [8]}\n"
+PPO = """
+ppo:
+  {total_timesteps: 256, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1, hidden: [8]}
+"""
 TABLE = """
 rows: [{algorithm: ppo, model: builtin}, {algorithm: ppo, model: nesam}]
 suites: [easy]

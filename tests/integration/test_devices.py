@@ -160,10 +160,10 @@ def test_to_ask_for_all_cores_too_late_is_an_error_that_says_what_to_do():
 
 
 PPO_CONFIG = PPOConfig(
-    transitions=512, num_envs=16, num_steps=16, minibatches=4, epochs=2, hidden=(8,)
+    total_timesteps=512, num_envs=16, num_steps=16, minibatches=4, epochs=2, hidden=(8,)
 )
 SAC_CONFIG = SACConfig(
-    transitions=512,
+    total_timesteps=512,
     num_envs=16,
     num_steps=16,
     batch=32,

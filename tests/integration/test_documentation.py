@@ -94,14 +94,15 @@ def commands():
 FEW = "{updates: 1, updates_per_iteration: 1, warm_up: 0}"
 TASK = """
 ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 2}
+model: builtin
 navigation: {horizon_seconds: 3, settle_steps: 2}
 action_repeat: 2
 """
 SHORT = {
     "ppo.yaml": TASK
-    + "ppo: {transitions: 64, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1}",
+    + "ppo: {total_timesteps: 128, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1}",
     "sac.yaml": TASK
-    + "sac: {transitions: 128, num_envs: 8, num_steps: 8, learning_starts: 64, batch: 8}",
+    + "sac: {total_timesteps: 256, num_envs: 8, num_steps: 8, learning_starts: 64, batch: 8}",
     "table.yaml": """
 rows: [{algorithm: ppo, model: builtin}]
 suites: [easy]

@@ -36,11 +36,12 @@ GRASS = 3
 TINY = """
 ground: {train_worlds: 2, suites: [easy, obstacles], suite_worlds: 1, starts: 8, pairs: 2}
 navigation: {horizon_seconds: 3, settle_steps: 2}
+model: builtin
 simulator: {substeps: 1}
 action_repeat: 2
 planning: {candidates: 2, decisions: 1, model: builtin}
 ppo:
-  {transitions: 256, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1, hidden: [8],
+  {total_timesteps: 512, num_envs: 8, num_steps: 8, minibatches: 2, epochs: 1, hidden: [8],
    schedule: constant}
 loop: {checkpoint_every: 2}
 """
@@ -67,7 +68,7 @@ def run(train):
 
 
 def numbers(run):
-    timed = ("wall_time", "transitions_per_second")
+    timed = ("wall_time", "timesteps_per_second")
     lines = runs.read_metrics(run)
     return [{name: line[name] for name in line if name not in timed} for line in lines]
 
@@ -87,7 +88,7 @@ def test_a_run_leaves_all_that_was_promised(run, folder):
     lines = runs.read_metrics(run)
     assert [line["step"] for line in lines] == [1, 2, 3, 4]
     # Steps of the environments, 64 actions an iteration that are held for two of them.
-    assert [line["transitions"] for line in lines] == [128, 256, 384, 512]
+    assert [line["timesteps"] for line in lines] == [128, 256, 384, 512]
     assert all(np.isfinite(line["policy_loss"]) for line in lines)
     assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["2", "4"]
     summary = json.loads((run / "summary.json").read_text())
@@ -127,7 +128,7 @@ def test_resuming_is_as_if_never_stopped(run, train, monkeypatch):
 @pytest.mark.parametrize("name", ["sac", pytest.param("td3", marks=pytest.mark.slow)])
 def test_other_algorithms_leave_the_same_and_resume(name, folder, tmp_path):
     settings = (
-        "{transitions: 192, num_envs: 8, num_steps: 8, updates: 1, batch: 8, buffer_size: 64, "
+        "{total_timesteps: 384, num_envs: 8, num_steps: 8, updates: 1, batch: 8, buffer_size: 64, "
     )
     settings += "learning_starts: 64, hidden: [8]}"
     # Policies that also see the ground by the world model's encoders.
@@ -158,10 +159,10 @@ def test_what_is_set_beside_resume_is_kept(run, train, tmp_path):
     message = refusal(door("ppo"), "--resume", again, "--ppo.hidden", 16)
     assert "actor" in message and "16]" in message and "8]" in message
     assert (again / "config.yaml").read_text() == before
-    train("--resume", str(again), "--ppo.transitions", "320")
+    train("--resume", str(again), "--ppo.total-timesteps", "640")
     assert [line["step"] for line in numbers(again)] == [1, 2, 3, 4, 5]
     config = configuration.load(PPOTraining, again / "config.yaml")
-    assert config.ppo.transitions == 320 and config.resume is None
+    assert config.ppo.total_timesteps == 640 and config.resume is None
 
 
 @pytest.mark.parametrize(
@@ -188,12 +189,12 @@ def test_bad_settings_are_named(tmp_path, capsys, text, words):
 
 def test_bad_worlds_are_named(folder, tmp_path):
     tiny = ("--config", folder / "tiny.yaml", "--runs", tmp_path / "runs")
-    assert "nowhere" in refusal(door("ppo"), *tiny, "--worlds", tmp_path / "nowhere")
+    assert "nowhere" in refusal(door("ppo"), *tiny, "--terrain", tmp_path / "nowhere")
     maps(tmp_path / "maps", count=2)
-    message = refusal(door("ppo"), *tiny, "--worlds", tmp_path / "maps")
+    message = refusal(door("ppo"), *tiny, "--terrain", tmp_path / "maps")
     assert "held_out_every: expected at most the 2 worlds found" in message
     (tmp_path / "maps" / "map_0.npz").write_bytes(b"no archive")
-    assert "map_0.npz" in refusal(door("ppo"), *tiny, "--worlds", tmp_path / "maps")
+    assert "map_0.npz" in refusal(door("ppo"), *tiny, "--terrain", tmp_path / "maps")
     assert not (tmp_path / "runs").exists()
 
 
@@ -217,7 +218,7 @@ def test_a_run_is_evaluated_as_at_its_end(run, tmp_path, capsys):
 def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch):
     navigate = ["navigation", "--policy"]
     maps(tmp_path / "maps", count=2)
-    door("evaluate")([*navigate, str(run), "--worlds", str(tmp_path / "maps")])
+    door("evaluate")([*navigate, str(run), "--terrain", str(tmp_path / "maps")])
     said = capsys.readouterr().out
     assert "driving 4 tasks on 2 worlds" in said and "  straight to goal: " in said
     # The usual worlds are many.

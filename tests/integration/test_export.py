@@ -44,11 +44,12 @@ BASES = {"look ahead": LookAhead(CONFIG), "straight to goal": StraightToGoal(CON
 TINY = """
 ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 1}
 simulator: {substeps: 1}
+model: builtin
 navigation: {settle_steps: 1}
 action_repeat: 3
 loop: {seeds: 2}
 sac:
-  {transitions: 64, num_envs: 8, num_steps: 8, batch: 8, buffer_size: 64, learning_starts: 64,
+  {total_timesteps: 192, num_envs: 8, num_steps: 8, batch: 8, buffer_size: 64, learning_starts: 64,
   hidden: [8]}
 """
 

@@ -24,9 +24,10 @@ TINY = """
 ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 16}
 navigation: {horizon_seconds: 3, settle_steps: 2}
 simulator: {substeps: 1}
+model: builtin
 action_repeat: 2
 planning: null
-ppo: {transitions: 256, num_envs: 16, num_steps: 8, minibatches: 2, epochs: 1, hidden: [8]}
+ppo: {total_timesteps: 512, num_envs: 16, num_steps: 8, minibatches: 2, epochs: 1, hidden: [8]}
 """
 
 
@@ -61,7 +62,7 @@ def together(*argv: object) -> list[tuple[int, str, str]]:
 
 def numbers(run):
     """Metrics of all iterations."""
-    timed = ("wall_time", "transitions_per_second")
+    timed = ("wall_time", "timesteps_per_second")
     lines = runs.read_metrics(run)
     return [{name: line[name] for name in line if name not in timed} for line in lines]
 

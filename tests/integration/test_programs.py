@@ -27,7 +27,7 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("programs")
     (folder / "tiny.yaml").write_text(CONFIG)
     runs = folder / "runs"
-    policy = vw.train(folder / "tiny.yaml", hill(), runs=runs, model="builtin", transitions=128)
+    policy = vw.train(folder / "tiny.yaml", hill(), runs=runs, model="builtin", total_timesteps=256)
     (run,) = runs.iterdir()
     return policy, run
 

@@ -19,10 +19,11 @@ from vertiwm_jax.terrain import map as terrain_map
 TINY = """
 ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 2}
 simulator: {substeps: 1}
+model: builtin
 navigation: {horizon_seconds: 2, settle_steps: 1}
 loop: {seeds: 2}
 sac:
-  {transitions: 64, num_envs: 8, num_steps: 8, batch: 8, buffer_size: 64, learning_starts: 64,
+  {total_timesteps: 64, num_envs: 8, num_steps: 8, batch: 8, buffer_size: 64, learning_starts: 64,
   hidden: [8]}
 """
 

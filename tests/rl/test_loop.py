@@ -22,7 +22,7 @@ from vertiwm_jax.training import (
 )
 
 CONFIG = PPOConfig(
-    transitions=6 * 32, num_envs=4, num_steps=8, minibatches=2, epochs=2, hidden=(8,)
+    total_timesteps=6 * 32, num_envs=4, num_steps=8, minibatches=2, epochs=2, hidden=(8,)
 )
 
 
@@ -35,7 +35,7 @@ def go(algorithm, run, iterations, env_params=ProbeParams(), **config):
     config = LoopConfig(**{"seeds": 2, "checkpoint_every": 4, **config})
     seeds = Seeds(algorithm, config.seeds)
     restored = restore(seeds, env_params, run.folder)
-    work = Work("transitions", 32 * config.seeds, ())
+    work = Work("timesteps", 32 * config.seeds, ())
     return train(seeds, env_params, jax.random.key(0), run, iterations, work, config, restored)
 
 
@@ -54,16 +54,16 @@ def interrupt_at(monkeypatch, iteration):
 def test_resumed_training_ends_with_the_same_bits(new_run, monkeypatch):
     ppo = PPO(Target(), CONFIG)
     straight_run, stopped_run = new_run(), new_run()
-    straight = go(ppo, straight_run, CONFIG.iterations)
+    straight = go(ppo, straight_run, ppo.iterations)
     with monkeypatch.context() as patch:
         interrupt_at(patch, 3)
         with pytest.raises(TrainingInterrupted, match=r"iteration 3 of 6.*--resume"):
-            go(ppo, stopped_run, CONFIG.iterations)
-    resumed = go(ppo, Run.open(stopped_run.folder, 3, CONFIG), CONFIG.iterations)
+            go(ppo, stopped_run, ppo.iterations)
+    resumed = go(ppo, Run.open(stopped_run.folder, 3, CONFIG), ppo.iterations)
     chex.assert_trees_all_equal(straight, resumed)
 
     def numbers(run):
-        timed = ("wall_time", "transitions_per_second")
+        timed = ("wall_time", "timesteps_per_second")
         lines = runs.read_metrics(run.folder)
         return [{name: line[name] for name in line if name not in timed} for line in lines]
 
@@ -79,7 +79,7 @@ def test_metrics_checkpoints_and_the_finished_state(new_run, caplog):
     chex.assert_trees_all_equal(state.count, jnp.full(2, 11.0))
     lines = runs.read_metrics(run.folder)
     assert [line["count"] for line in lines] == list(range(1, 11))
-    assert [line["transitions"] for line in lines] == [64 * step for step in range(1, 11)]
+    assert [line["timesteps"] for line in lines] == [64 * step for step in range(1, 11)]
     assert not any("never" in line or "finite" in line for line in lines)
     kept = sorted(path.name for path in (run.folder / "checkpoints").iterdir())
     assert kept == ["10", "8"]
@@ -91,7 +91,7 @@ def test_metrics_checkpoints_and_the_finished_state(new_run, caplog):
 def test_a_number_that_is_none_stops_with_the_last_good_checkpoint(new_run):
     run = new_run()
     with pytest.raises(TrainingError, match=r"iteration 6: .*checkpoints/4; try") as error:
-        go(PPO(Broken(), CONFIG), run, CONFIG.iterations)
+        go(PPO(Broken(), CONFIG), run, 6)
     assert "\n" not in str(error.value)
     latest = checkpoints.latest(run.folder / "checkpoints")
     assert latest is not None and latest.name == "4"

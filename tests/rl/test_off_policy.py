@@ -14,7 +14,7 @@ from vertiwm_jax.rl.sac import SAC, SACConfig
 from vertiwm_jax.rl.td3 import TD3, TD3Config
 
 SETTINGS = {
-    "transitions": 4096,
+    "total_timesteps": 4096,
     "num_envs": 16,
     "num_steps": 16,
     "updates": 8,
@@ -57,7 +57,7 @@ def train(algorithm, env_params=ProbeParams(), iterations=None):
     """The state and the metrics of the last of `iterations`, all by default."""
     init, iterate = compiled(algorithm)
     state, metrics = init(env_params, jax.random.key(0)), {}
-    for _ in range(algorithm.config.iterations if iterations is None else iterations):
+    for _ in range(algorithm.iterations if iterations is None else iterations):
         state, metrics = iterate(env_params, state)
     return state, metrics
 
@@ -83,14 +83,14 @@ def test_delayed_reward_is_discounted(name):
     state, metrics = train(delayed)
     np.testing.assert_allclose(values(delayed, state, 0.0, 1.0), [0.9, 1.0], atol=0.05)
     assert float(metrics["last"]) == 2.0
-    assert float(metrics["episodes"]) == delayed.config.collected / 2
+    assert float(metrics["episodes"]) == delayed.timesteps / 2
 
 
 @each
 @pytest.mark.integration
 def test_truncation_is_bootstrapped(name):
     quiet = {"initial_temperature": 1e-9, "target_entropy": -20.0} if name == "sac" else {}
-    endless = algorithm(name, Endless(), tau=0.2, transitions=8192, **quiet)
+    endless = algorithm(name, Endless(), tau=0.2, total_timesteps=8192, **quiet)
     state, metrics = train(endless, ProbeParams(max_steps_in_episode=5))
     assert float(metrics["episode_length"]) == 5
     np.testing.assert_allclose(values(endless, state, 0.0), 1 / (1 - 0.9), rtol=0.08)

@@ -21,7 +21,7 @@ from vertiwm_jax.rl.learned import ResidualPolicy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 
 CONFIG = PPOConfig(
-    transitions=20_000,
+    total_timesteps=20_000,
     num_envs=16,
     num_steps=16,
     minibatches=2,
@@ -34,7 +34,7 @@ CONFIG = PPOConfig(
 )
 
 
-TARGET = PPO(Target(), PPOConfig(**{**vars(CONFIG), "transitions": 40_000}))
+TARGET = PPO(Target(), PPOConfig(**{**vars(CONFIG), "total_timesteps": 40_000}))
 
 
 @functools.cache
@@ -47,7 +47,7 @@ def train(ppo, env_params=ProbeParams(), seed=0, iterations=None):
     """The state and the metrics of the last of `iterations`, all by default."""
     init, iterate = compiled(ppo)
     state, metrics = init(env_params, jax.random.key(seed)), {}
-    for _ in range(ppo.config.iterations if iterations is None else iterations):
+    for _ in range(ppo.iterations if iterations is None else iterations):
         state, metrics = iterate(env_params, state)
     return state, metrics
 
@@ -66,7 +66,7 @@ def test_constant_reward_is_its_value(normalise):
     np.testing.assert_allclose(values(ppo, state, 0.0), 1.0, atol=0.02)
     assert float(metrics["episode_return"]) == 1.0
     assert float(metrics["episode_length"]) == 1.0
-    assert float(metrics["episodes"]) == CONFIG.collected
+    assert float(metrics["episodes"]) == ppo.timesteps
 
 
 @pytest.mark.parametrize("normalise", [False, True])
@@ -82,7 +82,7 @@ def test_delayed_reward_is_discounted():
     np.testing.assert_allclose(values(ppo, state, 0.0, 1.0), [0.9, 1.0], atol=0.03)
     assert float(metrics["last"]) == 2.0
     assert float(metrics["episode_return"]) == 1.0
-    assert float(metrics["episodes"]) == CONFIG.collected / 2
+    assert float(metrics["episodes"]) == ppo.timesteps / 2
 
 
 @pytest.mark.parametrize("normalise", [False, True])
@@ -141,9 +141,10 @@ def test_value_clip_bounds_what_is_learned_in_an_iteration():
 )
 def test_learning_rate_halfway(schedule, share):
     config = PPOConfig(**{**vars(CONFIG), "schedule": schedule})
-    halfway = config.iterations * config.epochs * config.minibatches // 2
+    ppo = PPO(Constant(), config)
+    halfway = ppo.iterations * config.epochs * config.minibatches // 2
     np.testing.assert_allclose(
-        config.learning_rate_schedule(halfway), share * config.learning_rate, rtol=1e-2
+        ppo.learning_rate_schedule(halfway), share * config.learning_rate, rtol=1e-2
     )
 
 

@@ -144,7 +144,7 @@ class Navigation:
     """Processes that drive, in Chrono."""
     vehicle: str | None = None
     """Name or YAML file of another vehicle than the policy's training was meant for."""
-    worlds: Path | None = None
+    terrain: Path | None = None
     """A Verti-Bench checkout or a folder of .npz maps, to drive on all of them."""
     obstacles: bool = False
     """Whether the rocks and trees of these maps stand there."""
@@ -164,9 +164,9 @@ class Navigation:
     def check(self):
         drawn = ("suites", "suite_worlds", "seed")
         found = [name for name in drawn if getattr(self, name) not in ((), None)]
-        if self.worlds and found:
-            raise ValueError(f"{found[0]}: is of procedural worlds, give it or worlds")
-        if self.obstacles and not self.worlds:
+        if self.terrain and found:
+            raise ValueError(f"{found[0]}: is of procedural worlds, give it or terrain")
+        if self.obstacles and not self.terrain:
             raise ValueError("obstacles: is of given worlds; procedural ones are a suite")
         if self.planning is not None and not isinstance(self.policy, Path):
             raise ValueError(f"planning: is of the policy of a run, found {self.policy}")
@@ -272,7 +272,7 @@ def _navigate(command: Navigation) -> None:
     trained = experiment.load(file)
     config = _adapted(trained, command)
     external.expect(command.simulator, config)
-    maps, scale = command.worlds, config.driven.scale
+    maps, scale = command.terrain, config.driven.scale
     if maps:
         terrain = files.load_map(maps, scale=scale, obstacles=config.ground.obstacles)
     else:
@@ -296,7 +296,7 @@ def _navigate(command: Navigation) -> None:
         policies = {REFERENCE: policies[REFERENCE]}
     with processes.simulating(command.jobs) as mapped:
         judge = external.judge_in(command.simulator, config, terrain, mapped)
-        given, key = bool(config.worlds), config.key("testing")
+        given, key = bool(config.terrain), config.key("testing")
         groups = report.drive(test.env, test.params, policies, key, judge, given)
     print(f"\n{report.markdown(groups, REFERENCE)}")
     if command.output:
@@ -308,9 +308,9 @@ def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:
     """The configuration of a training with the test that the command asks for."""
     asked = {name: getattr(command, name) for name in ("suites", "suite_worlds", "pairs")}
     grounds = replace(config.ground, **{name: value for name, value in asked.items() if value})
-    if command.worlds:
+    if command.terrain:
         grounds = replace(grounds, obstacles=command.obstacles)
-        config = replace(config, worlds=command.worlds)
+        config = replace(config, terrain=command.terrain)
     if command.vehicle is not None:
         config = replace(config, vehicle=command.vehicle)
     if command.sensing_range is not None:

@@ -48,7 +48,7 @@ class NavigationConfig:
 
     goal_radius: float = 8.0
     horizon_seconds: float = 60.0
-    speed_range: tuple[float, float] = (0.0, 6.0)
+    speed_range: tuple[float, float] = (0.0, 5.0)
     map_margin: float = 1.0
     rollover_angle: float = np.pi / 3
     stalled_speed: float = 0.3

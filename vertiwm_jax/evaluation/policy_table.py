@@ -15,16 +15,16 @@ from vertiwm_jax.evaluation.report import Results
 
 @dataclass(frozen=True)
 class TrainingCost:
-    """What a training took, compilation and tests not included; transitions are of 0.1 s."""
+    """What a training took, compilation and tests not included; timesteps are of 0.1 s."""
 
     seconds: float
-    transitions: int
+    timesteps: int
 
     @classmethod
     def of(cls, run: Path) -> Self:
         """Of the training in the folder `run`, all of its sessions together."""
         columns = runs.read_columns(run)
-        done, rates = columns["transitions"], columns["transitions_per_second"]
+        done, rates = columns["timesteps"], columns["timesteps_per_second"]
         each = done[-1] / len(done)
         return cls(sum(each / rate for rate in rates), int(done[-1]))
 
@@ -36,13 +36,13 @@ def markdown(costs: Mapping[str, TrainingCost], judged: Mapping[str, Mapping[str
 
 
 def _table(costs: Mapping[str, TrainingCost], groups: Mapping[str, Results]) -> str:
-    heads = ["policy", "training [min]", "transitions/s", *groups, "the paper, in Chrono"]
+    heads = ["policy", "training [min]", "steps/s", *groups, "the paper, in Chrono"]
     rows = []
     for policy in next(iter(groups.values())):
         cost = next((x for name, x in costs.items() if policy.startswith(name)), None)
         spent = ["", ""]
         if cost:
-            spent = [f"{cost.seconds / 60:.1f}", f"{cost.transitions / cost.seconds:,.0f}"]
+            spent = [f"{cost.seconds / 60:.1f}", f"{cost.timesteps / cost.seconds:,.0f}"]
         driven = [_cell(Summary.of(results[policy])) for results in groups.values()]
         rows.append([policy, *spent, *driven, DRIVING.get(policy, "")])
     return tables.markdown(heads, rows)

@@ -53,12 +53,12 @@ def after_training(trained: Trained) -> str:
     config, folder = trained.config, trained.folder
     columns = runs.read_columns(folder)
     labels = {name: label for name, label in CURVES.items() if name in columns}
-    figure = plots.learning_curves({config.name: columns}, "transitions", labels, "transitions")
+    figure = plots.learning_curves({config.name: columns}, "timesteps", labels, "steps of 0.1 s")
     figures.save(figure, folder / "learning_curves.png")
     machine.forget_programs()  # Tests need the memory.
     test = experiment.test_environment(config, trained.held_out)
     policies = experiment.learned(config, folder) | config.baselines
-    given = trained.given or config.worlds is not None
+    given = trained.given or config.terrain is not None
     groups = drive(test.env, test.params, policies, config.key("testing"), given=given)
     write(folder, groups, REFERENCE, test.params.terrain, config.navigation.goal_radius)
     return markdown(groups, REFERENCE)

@@ -47,12 +47,14 @@ _log = logging.getLogger(__name__)
 class TaskConfig:
     """What is driven, where, and with what."""
 
+    GONE: ClassVar[dict[str, str]] = {"worlds": "is now terrain"}
+
     seed: int = 0
     """Decides everything that is random."""
     vehicle: str = HMMWV
     """What the built-in simulator drives: the name of a vehicle that comes along, or a YAML file of
     one; other models drive what they were fitted to."""
-    worlds: Path | None = None
+    terrain: Path | None = None
     """A Verti-Bench checkout or a folder of .npz maps; procedural worlds by default."""
     ground: GroundConfig = GroundConfig()
     """What worlds and tasks."""
@@ -60,7 +62,7 @@ class TaskConfig:
     """What the task is."""
     variation: RandomizationConfig = RandomizationConfig()
     """How episodes differ from what map and model say, while learning."""
-    model: ModelName = "builtin"
+    model: ModelName = "vertiwm"
     """What moves the vehicle while learning; tests after it are in the built-in simulator."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
@@ -111,8 +113,8 @@ class TrainConfig(TaskConfig, ABC):
     """Project of Weights & Biases that gets the metrics too; needs the package `wandb`."""
     compile_cache: Path | None = None
     """Folder that keeps compiled programs for later runs."""
-    action_repeat: Count = 4
-    """Steps of 0.1 s that an action is held while learning; `transitions` count actions."""
+    action_repeat: Count = 8
+    """Steps of 0.1 s that an action is held while learning."""
     base: Base = "look ahead"
     """The controller that the policy learns to correct; it acts at every step."""
     planning: ImprovementConfig | None = None
@@ -232,7 +234,7 @@ def training_ground(
     navigation, driven = config.navigation, config.driven
     key = config.key("worlds")
     if given is None:
-        terrain, held_out = suites.grounds(config.ground, config.worlds, key, driven.scale)
+        terrain, held_out = suites.grounds(config.ground, config.terrain, key, driven.scale)
     else:
         terrain = held_out = given
     # Now, and not when the training is over.
@@ -245,9 +247,9 @@ def training_ground(
 def held_out(config: TaskConfig) -> TerrainMap:
     """The worlds that `training_environment` holds out."""
     key, scale = config.key("worlds"), config.driven.scale
-    if config.worlds is None:
+    if config.terrain is None:
         return suites.suite_worlds(config.ground, key, scale)
-    return suites.grounds(config.ground, config.worlds, key, scale)[1]
+    return suites.grounds(config.ground, config.terrain, key, scale)[1]
 
 
 def test_environment(config: TaskConfig, terrain: TerrainMap, model: ModelName = "builtin") -> Task:
@@ -319,7 +321,7 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
     """
     keep_compiled(config.compile_cache)
     # So that it goes on as it began, and is tested, from wherever that is.
-    paths = {name: getattr(config, name) for name in ("worlds", "weights")}
+    paths = {name: getattr(config, name) for name in ("terrain", "weights")}
     absolute = {name: path and path.absolute() for name, path in paths.items()}
     config = replace(config, operands=config.multiplied, **absolute)
     _log.info("drawing worlds ...")
@@ -329,10 +331,10 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
     env = NavigationEnv(moves, config.navigation, config.variation)
     driven = config.driven.vehicle, encoders(config)
     shapes = env.shapes(weights, terrain, pool, *driven)
-    algorithm, schedule = config.algorithm(env), config.schedule
+    algorithm = config.algorithm(env)
     seeds = Seeds(algorithm, config.loop.seeds)
     restored = training.restore(seeds, shapes, config.resume) if config.resume else None
-    if not restored or restored[0] < schedule.iterations:
+    if not restored or restored[0] < algorithm.iterations:
         # Now, while there are no vehicles yet that fill the memory.
         training.compiled(seeds, shapes)
     _log.info("placing vehicles for %s tasks ...", f"{len(pool.world):,}")
@@ -347,9 +349,9 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
             learned = algorithm.policy(params, state), algorithm.value(params, state)
             policy.save(begun.folder / policy.FOLDER, config.of_policy, *learned)
 
-        steps = schedule.collected * config.action_repeat * config.loop.seeds
-        work = Work("transitions", steps, ("episode_return", "success"))
-        key, iterations = config.key("training"), schedule.iterations
+        steps = algorithm.timesteps * config.loop.seeds
+        work = Work("timesteps", steps, ("episode_return", "success"))
+        key, iterations = config.key("training"), algorithm.iterations
         state = training.train(
             seeds, params, key, begun, iterations, work, config.loop, restored, keep
         )
@@ -397,7 +399,7 @@ def train(
     if schedule:
         changed[chosen.name] = replace(chosen.schedule, **schedule)
     if isinstance(terrain, str | Path):
-        changed["worlds"] = Path(terrain)
+        changed["terrain"] = Path(terrain)
     changed |= {"runs": Path(runs), "resume": Path(resume) if resume else None}
     given = terrain if isinstance(terrain, TerrainMap) else None
     return load_policy(run(replace(chosen, **changed), given).folder)

@@ -16,7 +16,7 @@ from flax import struct
 from gymnax.environments.environment import Environment
 
 from vertiwm_jax import parallel
-from vertiwm_jax.config import ConfigError, Count, NotNegative, Share, settings
+from vertiwm_jax.config import ConfigError, Count, NotNegative, Positive, Share, settings
 from vertiwm_jax.networks.policy import (
     ActionCritic,
     ObservationLayout,
@@ -45,10 +45,18 @@ class OffPolicyConfig(LearningConfig):
         "restraint": "is now action_penalty",
     }
 
+    num_envs: Count = 128
+    """Environments run side by side."""
+    num_steps: Count = 16
+    """Actions in each environment in an iteration; each is held for `action_repeat` steps."""
+    learning_rate: Positive = 5e-4
+    """Of Adam."""
+    max_gradient_norm: Positive = 10.0
+    """Gradients are clipped to this global norm."""
     updates: Count = 8
     """Gradient steps after every step of all environments."""
     batch: Count = 512
-    """Transitions in a gradient step."""
+    """Transitions in a gradient step; one is an action, held for `action_repeat` steps."""
     buffer_size: Count = 131_072
     """Transitions that the replay buffer holds; a multiple of num_envs."""
     learning_starts: int = 8_192

@@ -36,7 +36,7 @@ _BY_ENVIRONMENT = PartitionSpec(None, BATCH)
 
 @settings
 class PPOConfig(LearningConfig):
-    """Settings of PPO; the defaults suit the navigation task on the built-in simulator."""
+    """Settings of PPO."""
 
     GONE: ClassVar[dict[str, str]] = LearningConfig.GONE | {
         "accumulate": "is now grad_accumulation",
@@ -46,11 +46,11 @@ class PPOConfig(LearningConfig):
         "entropy_weight": "is now ent_coef",
     }
 
-    initial_log_std: float = -0.5
+    initial_log_std: float = -0.9
     """Log standard deviation of the first policy, in units of half the action range."""
     epochs: Count = 6
     """Passes over the data of an iteration."""
-    minibatches: Count = 8
+    minibatches: Count = 4
     """Gradient steps in a pass, each from as many steps of every environment; divides num_steps."""
     grad_accumulation: Count = 1
     """Parts of a minibatch whose gradients are computed one after the other, for less memory."""
@@ -75,16 +75,6 @@ class PPOConfig(LearningConfig):
                 f"minibatches: expected minibatches * grad_accumulation, {parts}, to divide "
                 f"num_steps, {self.num_steps}; choose a divisor, for example {divisor}"
             )
-
-    @property
-    def learning_rate_schedule(self) -> optax.Schedule:
-        """Learning rate as a function of the gradient steps done."""
-        steps = self.iterations * self.epochs * self.minibatches
-        return {
-            "constant": optax.constant_schedule(self.learning_rate),
-            "linear": optax.linear_schedule(self.learning_rate, 0.0, steps),
-            "cosine": optax.cosine_decay_schedule(self.learning_rate, steps),
-        }[self.schedule]
 
 
 @struct.dataclass
@@ -170,6 +160,17 @@ class PPO(PolicyAlgorithm[TrainState]):
     outcomes: Outcomes = lambda info: {}
     layout: ObservationLayout = ObservationLayout()
 
+    @property
+    def learning_rate_schedule(self) -> optax.Schedule:
+        """Learning rate as a function of the gradient steps done."""
+        rate = self.config.learning_rate
+        steps = self.iterations * self.config.epochs * self.config.minibatches
+        return {
+            "constant": optax.constant_schedule(rate),
+            "linear": optax.linear_schedule(rate, 0.0, steps),
+            "cosine": optax.cosine_decay_schedule(rate, steps),
+        }[self.config.schedule]
+
     def init(self, data: Params, key: jax.Array) -> TrainState:
         """The state before the first iteration."""
         key, reset_key, actor_key, critic_key = jax.random.split(key, 4)
@@ -224,7 +225,7 @@ class PPO(PolicyAlgorithm[TrainState]):
 
     @property
     def _optimizer(self) -> optax.GradientTransformation:
-        return self.config.adam(self.config.learning_rate_schedule, eps=1e-5)
+        return self.config.adam(self.learning_rate_schedule, eps=1e-5)
 
     def _value(self, params: Params, observation: jax.Array) -> jax.Array:
         return cast(jax.Array, self._critic.apply(params["critic"], observation))

@@ -22,7 +22,7 @@ from vertiwm_jax.rl.off_policy import Learner, OffPolicy, OffPolicyConfig, Param
 class SACConfig(OffPolicyConfig):
     """Settings of SAC."""
 
-    initial_log_std: float = -0.5
+    initial_log_std: float = -0.9
     """Log standard deviation of the first policy, in units of half the action range."""
     initial_temperature: Positive = 0.1
     """Worth of a nat of entropy in the first policy, in units of (normalized) reward."""

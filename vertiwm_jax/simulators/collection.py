@@ -63,7 +63,7 @@ class CollectConfig:
     """What moves the vehicle; Chrono needs PyChrono, and has the HMMWV alone."""
     vehicle: str = HMMWV
     """Name of a vehicle that comes along, or a YAML file of one; drives are at its full size."""
-    worlds: Path | None = None
+    terrain: Path | None = None
     """A Verti-Bench checkout or a folder of .npz maps, to drive on all of them."""
     obstacles: bool = False
     """Whether the rocks and trees of these maps stand there, in Chrono."""
@@ -85,7 +85,7 @@ class CollectConfig:
     """Processes that simulate."""
 
     def check(self):
-        if self.obstacles and not (self.worlds and self.simulator == "chrono"):
+        if self.obstacles and not (self.terrain and self.simulator == "chrono"):
             raise ValueError("obstacles: are solid in Chrono alone, and are those of given worlds")
         if self.vehicle != HMMWV and self.simulator == "chrono":
             raise ValueError(f"vehicle: expected {HMMWV} in Chrono, found {self.vehicle}")
@@ -170,8 +170,8 @@ def record_task(task: Task) -> Drive:
 
 def _terrain(config: CollectConfig, scale: float) -> TerrainMap:
     """All worlds to drive on."""
-    if config.worlds:
-        return files.load_map(config.worlds, scale=scale, obstacles=config.obstacles)
+    if config.terrain:
+        return files.load_map(config.terrain, scale=scale, obstacles=config.obstacles)
     count = config.repeats * len(config.difficulties) * len(config.kinds)
     keys = jax.random.split(jax.random.key(config.seed), count)
     return worlds.generate(keys, WorldConfig(config.difficulties, config.kinds), scale)
