@@ -8,6 +8,7 @@ trajectories by `lax.scan`; weights, maps and state are arguments.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from typing import Any, Protocol, TypeVar
 
 import jax
@@ -82,18 +83,14 @@ def warm_up(
 ) -> History:
     """The history after a recorded context: `states` leaves `[C + 1, 3]`, `commands` `[C]`.
 
-    Each step starts from the recorded state, so that only what the state does not say (wheel
-    speeds, steering angle, past tokens) is carried along.
+    Each step starts from the recorded state, and looks at the ground there, so that only what the
+    state does not say (wheel speeds, steering angle, past tokens) is carried along.
     """
-    first = jax.tree.map(lambda x: x[0], states)
+    first, last = (jax.tree.map(itemgetter(i), states) for i in (0, -1))
     before = jax.tree.map(lambda x: x[:-1], states)
-
-    def advance(history: History, inputs: tuple[VehicleState, Command]) -> tuple[History, None]:
-        _, history = dynamics.step(params, terrain, history, *inputs)
-        return history, None
-
-    history, _ = jax.lax.scan(advance, dynamics.init(params, terrain, first), (before, commands))
-    return history
+    begun = dynamics.init(params, terrain, first)
+    history, _ = _steps(dynamics, params, terrain, begun, before, commands, lambda _: None)
+    return _seeing(dynamics, params, terrain, history, last)
 
 
 def along(
@@ -111,20 +108,42 @@ def along(
     Returns:
         Where each step leads, leaves `[T, 3]`, and what is read of the histories after them.
     """
+    begun = dynamics.init(params, terrain, jax.tree.map(lambda x: x[0], states))
+    return _steps(dynamics, params, terrain, begun, states, commands, read)[1]
 
-    see = getattr(dynamics, "see", None)
 
-    def seeing(history: History, features: Any) -> History:
-        return replace(history, features=features) if see else history
+def _steps(
+    dynamics: Dynamics,
+    params: Params,
+    terrain: TerrainMap,
+    begun: History,
+    states: VehicleState,
+    commands: Command,
+    read: Callable[[History], T],
+) -> tuple[History, tuple[VehicleState, T]]:
+    """The last history, which has seen no ground yet, and what `along` returns."""
 
     def advance(history: History, inputs: tuple[VehicleState, Command]) -> tuple[History, Any]:
         state, command = inputs
-        history = seeing(history, see(params, terrain, state) if see else None)
+        history = _seeing(dynamics, params, terrain, history, state)
         proposed, history = dynamics.step(params, terrain, history, state, command)
-        return seeing(history, None), (proposed, read(history))
+        return _seeing(dynamics, params, terrain, history, None), (proposed, read(history))
 
-    first = dynamics.init(params, terrain, jax.tree.map(lambda x: x[0], states))
-    return jax.lax.scan(advance, seeing(first, None), (states, commands))[1]
+    unseeing = _seeing(dynamics, params, terrain, begun, None)
+    return jax.lax.scan(advance, unseeing, (states, commands))
+
+
+def _seeing(
+    dynamics: Dynamics,
+    params: Params,
+    terrain: TerrainMap,
+    history: History,
+    state: VehicleState | None,
+) -> History:
+    """The history with a look at the ground at `state`, or without one, if the model looks."""
+    if see := getattr(dynamics, "see", None):
+        return replace(history, features=state and see(params, terrain, state))
+    return history
 
 
 def rollout(

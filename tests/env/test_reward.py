@@ -22,7 +22,8 @@ def value(**changes):
     }
     terms.update(changes)
     arrays = {name: jnp.asarray(x) for name, x in terms.items()}
-    return float(reward(RewardConfig(disagreement=100.0, spread=1000.0), **arrays))
+    config = RewardConfig(stuck=300.0, failure=600.0, disagreement=100.0, spread=1000.0)
+    return float(reward(config, **arrays))
 
 
 @pytest.mark.parametrize(

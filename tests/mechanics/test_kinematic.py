@@ -1,7 +1,11 @@
+from dataclasses import replace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
@@ -130,16 +134,30 @@ def test_positive_pitch_is_nose_down_and_positive_roll_is_right_side_down():
 
 
 def test_warm_up_replays_the_recorded_states():
-    """The history after C commands has seen each recorded state with the command that follows."""
+    """It has seen each recorded state with the command that follows, and the ground there."""
+
+    @struct.dataclass
+    class Pages:
+        features: Any
+        written: jax.Array
 
     class Diary:
+        """Errs by a meter in each step, and writes down what it is given, and where it looks."""
+
         def init(self, params, terrain, state):
-            return jnp.zeros((2,))
+            return Pages(self.see(params, terrain, state), jnp.zeros(3))
+
+        def see(self, params, terrain, state):
+            return state.position[0]
 
         def step(self, params, terrain, history, state, command):
-            seen = 10 * history[0] + state.position[0]
-            return state, jnp.stack([seen, history[1] + command.speed])
+            read = jnp.stack([state.position[0], command.speed, history.features])
+            state = replace(state, position=state.position + 1)
+            return state, Pages(self.see(params, terrain, state), 10 * history.written + read)
 
-    states = jax.vmap(lambda i: VehicleState.from_vector(jnp.full(12, i)))(jnp.arange(1.0, 5.0))
+    states = jax.vmap(lambda i: VehicleState.from_vector(jnp.full(12, i)))(
+        jnp.arange(1.0, 9.0, 2.0)
+    )
     history = warm_up(Diary(), None, plane(0, 0), states, Command(jnp.arange(3.0), jnp.zeros(3)))
-    np.testing.assert_array_equal(history, [123.0, 3.0])
+    np.testing.assert_array_equal(history.written, [135.0, 12.0, 135.0])
+    assert history.features == 7.0
