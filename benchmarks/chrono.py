@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks._harness import Figures, parser, report
 from benchmarks.models import rates
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.simulators import excitation
 from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.terrain import worlds
@@ -19,7 +19,10 @@ VEHICLES = 256
 
 def driven(kind: Kind, drives: int, steps: int) -> dict[str, float | int]:
     """Rates of an HMMWV under the paper's commands, on a world of its own in each drive."""
-    config, lock = WorldConfig(difficulties=("mid",), kinds=(kind,)), float(hmmwv().steering_limit)
+    config, lock = (
+        WorldConfig(difficulties=("mid",), kinds=(kind,)),
+        float(load_vehicle().steering_limit),
+    )
     terrain = worlds.generate(jax.random.split(jax.random.key(0), drives), config)
     starting, stepping = [], []
     for number in range(drives):

@@ -5,6 +5,7 @@ On as many devices as `vertiwm_jax.parallel.mesh` gives a batch: every core of a
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -14,9 +15,9 @@ import jax.numpy as jnp
 from benchmarks._harness import Figures, measure, parser, report
 from vertiwm_jax import parallel
 from vertiwm_jax.dynamics import Params, rollout
-from vertiwm_jax.mechanics.kinematic import rest_on_ground
+from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.config import ModelConfig, with_soil
 from vertiwm_jax.models.registry import ModelName, load_model
 from vertiwm_jax.state import Command, VehicleState
@@ -33,26 +34,19 @@ PAPER = ModelConfig(size="paper")
 def drives(batch: int, steps: int) -> tuple[TerrainMap, VehicleState, Command]:
     """A mixed world, vehicles at rest on it, leaves `[B, 3]`, and commands, leaves `[B, T]`."""
     terrain = worlds.generate(jax.random.split(jax.random.key(0), 1), WorldConfig())
-    vehicle, keys = hmmwv(), jax.random.split(jax.random.key(1), 4)
-
-    def place(xy: jax.Array, yaw: jax.Array) -> VehicleState:
-        position, rpy = rest_on_ground(
-            terrain, xy, yaw, vehicle.wheelbase, vehicle.track, vehicle.wheel_radius
-        )
-        return VehicleState(position, rpy, jnp.zeros(3), jnp.zeros(3))
-
+    keys = jax.random.split(jax.random.key(1), 4)
     commands = Command(
         speed=jax.random.uniform(keys[0], (batch, steps), maxval=4.0),
         steering=jax.random.uniform(keys[1], (batch, steps), minval=-0.3, maxval=0.3),
     )
     xy = jax.random.uniform(keys[2], (batch, 2), minval=-40.0, maxval=40.0)
     yaw = jax.random.uniform(keys[3], (batch,), minval=-jnp.pi, maxval=jnp.pi)
-    return terrain, jax.jit(jax.vmap(place))(xy, yaw), commands
+    return terrain, jax.jit(jax.vmap(partial(place, terrain)))(xy, yaw), commands
 
 
 def untrained() -> tuple[VertiWM, VertiWMParams]:
     """A Verti-WM of the paper's size with random weights, for none comes along."""
-    params = PAPER.init_params(jax.random.key(0), chrono_like(hmmwv()))
+    params = PAPER.init_params(jax.random.key(0), chrono_like(load_vehicle()))
     return PAPER.verti_wm, with_soil(params, None)
 
 

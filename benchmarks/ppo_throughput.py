@@ -21,7 +21,7 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import parallel
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models import files
 from vertiwm_jax.models.config import Size
 from vertiwm_jax.models.registry import ModelName
@@ -97,7 +97,7 @@ def main() -> None:
         weights = None
         if chosen.size == "paper":
             weights = Path(folder)
-            params = PAPER.init_params(jax.random.key(0), chrono_like(hmmwv()))
+            params = PAPER.init_params(jax.random.key(0), chrono_like(load_vehicle()))
             files.save(weights, PAPER, params)
         for name in chosen.configs:
             for model in chosen.models:

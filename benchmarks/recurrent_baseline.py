@@ -22,7 +22,7 @@ from vertiwm_jax.learning.fitting import FitConfig
 from vertiwm_jax.learning.losses import LossConfig
 from vertiwm_jax.learning.objectives import RolloutLoss
 from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.runs import Run
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
@@ -84,7 +84,7 @@ class Recurrent:
         to_world = jnp.array([[cos, sin], [-sin, cos]])
         here = state.position[:2]
         around = query.height(terrain, here + GRID @ to_world) - state.position[2]
-        wheels = query.surface(terrain, here + hmmwv().wheel_position @ to_world)
+        wheels = query.surface(terrain, here + load_vehicle().wheel_position @ to_world)
         features = [
             constants.inputs(state, command),
             around / RELIEF,

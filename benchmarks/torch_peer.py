@@ -14,8 +14,7 @@ from benchmarks.peers.torch_query import Ground, tensor
 from benchmarks.peers.torch_vertiwm import TorchVertiWM
 from vertiwm_jax import machine, parallel
 from vertiwm_jax.dynamics import rollout
-from vertiwm_jax.mechanics.kinematic import rest_on_ground
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.models.registry import load_model
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import worlds
@@ -49,17 +48,13 @@ class Drives(NamedTuple):
     def draw(cls, batch: int, steps: int) -> "Drives":
         """Random ones, from 0 to 3 m/s."""
         terrain = worlds.generate(jax.random.split(jax.random.key(0), WORLDS), WorldConfig())
-        vehicle, keys = hmmwv(), jax.random.split(jax.random.key(1), 5)
+        keys = jax.random.split(jax.random.key(1), 5)
         world = jnp.arange(batch) % WORLDS
 
-        def place(world: jax.Array, xy: jax.Array, yaw: jax.Array, speed: jax.Array):
-            position, rpy = rest_on_ground(
-                *(terrain.select(world), xy, yaw),
-                *(vehicle.wheelbase, vehicle.track, vehicle.wheel_radius),
-            )
-            return VehicleState(position, rpy, jnp.zeros(3).at[0].set(speed), jnp.zeros(3))
+        def placed(world: jax.Array, xy: jax.Array, yaw: jax.Array, speed: jax.Array):
+            return place(terrain.select(world), xy, yaw, speed=speed)
 
-        starts = jax.jit(jax.vmap(place))(
+        starts = jax.jit(jax.vmap(placed))(
             world,
             jax.random.uniform(keys[0], (batch, 2), minval=-40.0, maxval=40.0),
             jax.random.uniform(keys[1], (batch,), minval=-jnp.pi, maxval=jnp.pi),

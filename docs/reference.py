@@ -49,7 +49,6 @@ PUBLIC = {
         "make_worlds",
         "terrain.files.from_heightmap",
         "terrain.files.save",
-        "terrain.map.build",
         "terrain.map.stack",
         "terrain.worlds.WorldConfig",
         "terrain.classes.GroundClasses",

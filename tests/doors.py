@@ -16,7 +16,7 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax.rl import experiment, policy
 from vertiwm_jax.rl.experiment import TrainConfig
 from vertiwm_jax.rl.learned import DeterministicPolicy
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 Door = Callable[[Sequence[str]], None]
 
@@ -59,7 +59,7 @@ def refusal(door: Door, *argv: object) -> str:
 def untrained(kind: type[TrainConfig], run: Path) -> list[DeterministicPolicy]:
     """Policies of random weights, one a seed, left as those of the run beside `config.yaml`."""
     config = configuration.load(kind, run / "config.yaml")
-    level = terrain_map.build(np.zeros((129, 129)), np.zeros((1, 1), int))
+    level = TerrainMap.from_array(np.zeros((129, 129)), np.zeros((1, 1), int))
     training = experiment.test_environment(config, level)
     algorithm = config.algorithm(training.env)
     keys = jax.random.split(jax.random.key(0), config.loop.seeds)

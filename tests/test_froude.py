@@ -6,8 +6,8 @@ import numpy as np
 
 from vertiwm_jax import froude
 from vertiwm_jax.mechanics.vehicle import Vehicle, load
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.classes import STANDARD
+from vertiwm_jax.terrain.map import TerrainMap
 
 
 def test_every_quantity_of_a_vehicle_has_its_power():
@@ -23,7 +23,9 @@ def test_every_quantity_of_a_vehicle_has_its_power():
 def test_larger_ground_is_the_same_but_for_its_scale():
     boxes = np.array([[1.0, 1.0, 0.1, 0.2, 0.3]])
     heights, classes = np.full((17, 17), 31.2), np.full((4, 4), 3)
-    small = terrain_map.build(heights, classes, obstacles=boxes, resolution=0.25, origin=(0.5, 2.0))
+    small = TerrainMap.from_array(
+        heights, classes, obstacles=boxes, resolution=0.25, origin=(0.5, 2.0)
+    )
     large = froude.scaled(small, 10.0)
     for name in ("elevation", "obstacles", "origin", "resolution"):
         np.testing.assert_allclose(getattr(large, name), 10 * getattr(small, name), rtol=1e-6)

@@ -19,7 +19,7 @@ from vertiwm_jax.env.gymnasium import NavigationGymEnv, NavigationVectorEnv
 from vertiwm_jax.env.navigation import NavigationEnv, make_env
 from vertiwm_jax.env.task import NavigationConfig, TaskParams
 from vertiwm_jax.env.tasks import random_tasks
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.registry import ModelName, load_encoders, load_model
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.files import load_map
@@ -97,7 +97,7 @@ class ProceduralNavigation(NavigationEnv):
         """Drawn and settled anew whenever asked for, in seconds: keep them, and pass them on."""
         world_key, task_key = jax.random.split(jax.random.key(self.seed))
         terrain = worlds.generate(jax.random.split(world_key, self.number), self.relief)
-        tasks = random_tasks(task_key, terrain, self.starts, hmmwv())
+        tasks = random_tasks(task_key, terrain, self.starts, load_vehicle())
         encoders = load_encoders() if self.config.embeddings else None
         return self.make_params(load_model(self.model)[1], terrain, tasks, encoders=encoders)
 

@@ -9,13 +9,14 @@ from jax.scipy.special import logit
 from vertiwm_jax.adaptation import soil_filter
 from vertiwm_jax.adaptation.soil_filter import SoilFilter, believed
 from vertiwm_jax.evaluation.adaptation import behaviour, mistaken
-from vertiwm_jax.mechanics.kinematic import rest_on_ground
+from vertiwm_jax.mechanics.kinematic import bicycle_of, place
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.registry import load_model
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import PRESETS, to_unit
 
 GRASS, MUD, SAND = 3, 7, 8
@@ -26,7 +27,7 @@ NOISE = (0.05, 0.05, 0.02, 0.03, 0.04, 0.02)
 def ground(*kinds: int) -> terrain_map.TerrainMap:
     """Level, 64 m square, in stripes from west to east."""
     row = np.repeat(kinds, 8 // len(kinds))
-    return terrain_map.build(np.full((65, 65), 4.0), np.tile(row, (8, 1)))
+    return TerrainMap.from_array(np.full((65, 65), 4.0), np.tile(row, (8, 1)))
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,7 @@ def test_at_first_the_map_is_believed():
 
 
 def test_physics_is_differentiated_exactly_and_has_to_read_the_map():
-    soil_filter._check(Simulator(), chrono_like(hmmwv()))
+    soil_filter._check(Simulator(), chrono_like(load_vehicle()))
     for name in ("nesam", "vertiwm"):
         soil_filter._check(*load_model(name, exact_gradient=True))
         with pytest.raises(ValueError, match=r"model: expected one of load_model.exact_gradient"):
@@ -170,12 +171,9 @@ def test_bad_settings_are_named(settings, words):
 
 @pytest.mark.slow
 def test_a_soil_that_the_map_has_wrong_is_recovered_while_driving():
-    terrain, params, model = ground(MUD), chrono_like(hmmwv()), Simulator()
+    terrain, params, model = ground(MUD), chrono_like(load_vehicle()), Simulator()
     vehicle = params.vehicle
-    position, rpy = rest_on_ground(
-        terrain, jnp.zeros(2), jnp.float32(0), vehicle.wheelbase, vehicle.track, jnp.float32(0.4)
-    )
-    start = VehicleState(position, rpy, jnp.zeros(3), jnp.zeros(3))
+    start = place(terrain, vehicle=replace(bicycle_of(vehicle), ride_height=jnp.float32(0.4)))
     time = 0.1 * jnp.arange(96)
     commands = Command(2.5 + 1.5 * jnp.sin(time), 0.3 * jnp.sin(0.7 * time))
     wrong = mistaken(terrain, PRESETS["snow"])

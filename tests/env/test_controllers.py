@@ -8,9 +8,9 @@ from vertiwm_jax.env import route
 from vertiwm_jax.env.controllers import LookAhead
 from vertiwm_jax.env.observation import observe
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.state import VehicleState
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 CONFIG = NavigationConfig()
 POLICY = LookAhead(CONFIG)
@@ -21,15 +21,16 @@ def command(terrain, goal):
     """Speed and steering of a vehicle at (0, 0) that looks east."""
     at_rest = VehicleState(jnp.array([0.0, 0.0, 0.47]), *jnp.zeros((3, 3)))
     routes = route.straight(CONFIG.route, terrain, goal[None, :2])
-    return hmmwv().command(
-        POLICY(observe(terrain, hmmwv(), at_rest, goal, routes, jnp.zeros(2))), CONFIG.speed_range
+    return load_vehicle().command(
+        POLICY(observe(terrain, load_vehicle(), at_rest, goal, routes, jnp.zeros(2))),
+        CONFIG.speed_range,
     )
 
 
 def ground(height):
     x = np.arange(-64.0, 65.0)
     elevation = height(*np.meshgrid(x, -x)) + np.zeros((129, 129))
-    return terrain_map.build(elevation, np.full((16, 16), GRASS))
+    return TerrainMap.from_array(elevation, np.full((16, 16), GRASS))
 
 
 FLAT = ground(lambda x, y: 0 * x)
@@ -42,7 +43,7 @@ def test_on_flat_ground_it_steers_to_the_goal(bearing):
     chosen = command(FLAT, goal)
     assert float(chosen.speed) == pytest.approx(POLICY.speed, rel=1e-5)
     # The arc to the goal has a radius of 40 m / (2 sin bearing); behind, either side is far.
-    aimed = np.arctan(hmmwv().wheelbase * np.sin(abs(bearing)) / 20)
+    aimed = np.arctan(load_vehicle().wheelbase * np.sin(abs(bearing)) / 20)
     if abs(bearing) < 2:
         assert abs(float(chosen.steering)) == pytest.approx(aimed, abs=0.16)
     else:

@@ -21,7 +21,7 @@ from vertiwm_jax.models.registry import load_encoders, load_model
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.state import VehicleState
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 CONFIG = NavigationConfig(speed_range=(0.0, 5.0), settle_steps=1, embeddings=True)
 BLIND = NavigationConfig(speed_range=(0.0, 5.0), settle_steps=1)
@@ -31,7 +31,7 @@ BLIND = NavigationConfig(speed_range=(0.0, 5.0), settle_steps=1)
 def terrain():
     semantic = np.full((16, 16), SNOW)
     semantic[:, 8:] = 0
-    return terrain_map.build(hills(), semantic)
+    return TerrainMap.from_array(hills(), semantic)
 
 
 def stepped(config, dynamics, params, terrain, encoders=None):

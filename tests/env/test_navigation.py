@@ -17,7 +17,7 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment as task_of_learning
 from vertiwm_jax.rl.experiment import TaskConfig
@@ -173,7 +173,7 @@ def test_reward_of_a_step_is_that_computed_by_hand():
 
 
 def test_actions_are_commands_and_back():
-    vehicle, speeds = hmmwv().replace(steering_limit=jnp.float32(0.4)), (-1.0, 5.0)
+    vehicle, speeds = load_vehicle().replace(steering_limit=jnp.float32(0.4)), (-1.0, 5.0)
     command = vehicle.command(jnp.array([[-1.0, 0.5], [1.0, -3.0], [0.0, 0.0]]), speeds)
     np.testing.assert_allclose(command.speed, [-1, 5, 2], rtol=1e-6)
     np.testing.assert_allclose(command.steering, [0.2, -0.4, 0], rtol=1e-6)

@@ -6,12 +6,12 @@ from env.worlds import GRASS, SNOW, hills
 
 from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.route import RouteConfig
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.state import VehicleState
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import obstacles, query
+from vertiwm_jax.terrain.map import TerrainMap
 
-HMMWV = hmmwv()
+HMMWV = load_vehicle()
 ROUTE = RouteConfig()
 POSES = jax.tree.map(np.asarray, observation.poses_ahead(HMMWV))
 OBSTACLE = np.array([[9.0, 3.0, 4.0, 6.0, 2.0]], np.float32)
@@ -38,7 +38,7 @@ def world(origin=None):
     semantic = np.full((16, 16), GRASS)
     semantic[7, 8] = SNOW
     relief = hills() + np.linspace(0, 3, 129, dtype=np.float32)
-    return terrain_map.build(relief, semantic, obstacles=OBSTACLE, origin=origin)
+    return TerrainMap.from_array(relief, semantic, obstacles=OBSTACLE, origin=origin)
 
 
 def test_layout_and_units():
@@ -91,7 +91,7 @@ def test_poses_lie_on_the_arcs_of_a_bicycle():
 def on_ground(height):
     """What the ground does to a vehicle at (0, 0) that looks 0.4 rad to the north of east."""
     x = np.arange(-64.0, 65.0)
-    terrain = terrain_map.build(height(*np.meshgrid(x, -x)), np.full((16, 16), GRASS))
+    terrain = TerrainMap.from_array(height(*np.meshgrid(x, -x)), np.full((16, 16), GRASS))
     seen = observe(terrain, vehicle(0.0, 0.0, 0.4), jnp.ones(3), jnp.zeros(2))
     return np.asarray(seen)[observation.GROUND].reshape(6, -1)
 
@@ -159,7 +159,7 @@ def test_turning_the_world_changes_nothing(quarter_turns):
     if quarter_turns % 2:
         wide, tall = tall, wide
     # Row 0 is north, so that rot90 turns the raster to the left as `turn` does.
-    turned = terrain_map.build(
+    turned = TerrainMap.from_array(
         np.rot90(still.elevation[0], quarter_turns),
         np.rot90(still.semantic[0], quarter_turns),
         obstacles=np.array([[*turn(x, y), wide, tall, height]]),

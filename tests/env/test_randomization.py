@@ -12,10 +12,10 @@ from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConf
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.state import Command, VehicleState
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.map import TerrainMap
 
 KEYS = jax.random.split(jax.random.key(0), 200)
 FLAT, TASK = ground(), task((0.0, 0.0), (30.0, 0.0))
@@ -79,8 +79,8 @@ def test_grip_scales_friction_and_soil_its_strength_wherever_the_ground_is_asked
 def test_a_vehicle_climbs_less_on_varied_ground():
     """A third of the grip on a slope of rigid ground: the simulator, unlike a bicycle, slips."""
     slope = np.broadcast_to(0.45 * np.arange(129.0) * 0.1, (129, 129)).astype(np.float32)
-    hill = terrain_map.build(slope, np.full((16, 16), 3), resolution=0.1, origin=(-6.4, 6.4))
-    model, params = Simulator(), chrono_like(hmmwv())
+    hill = TerrainMap.from_array(slope, np.full((16, 16), 3), resolution=0.1, origin=(-6.4, 6.4))
+    model, params = Simulator(), chrono_like(load_vehicle())
     pitch = -np.arctan(0.45)
     start = VehicleState(
         jnp.array([-2.0, 0.0, query.height(hill, jnp.array([-2.0, 0.0])) + 0.55]),

@@ -10,10 +10,11 @@ from scipy.sparse import csgraph
 from vertiwm_jax.env import route
 from vertiwm_jax.env.route import RouteConfig
 from vertiwm_jax.env.traversability import TraversabilityCost, footprint, places
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
-HMMWV = hmmwv()
+HMMWV = load_vehicle()
 CONFIG = RouteConfig(cells=32)
 EAST = jnp.array([[50.0, 1.0]])
 
@@ -144,7 +145,7 @@ def test_each_goal_has_the_ground_of_its_world():
 
 
 def test_maps_need_not_be_square():
-    terrain = terrain_map.build(np.zeros((65, 129)), np.full((8, 16), GRASS))
+    terrain = TerrainMap.from_array(np.zeros((65, 129)), np.full((8, 16), GRASS))
     routes = to([[50.0, 20.0]], terrain)
     found = routes.cost_to_go(terrain, jnp.array([[-50.0, 20.0], [50.0, -20.0]]))
     np.testing.assert_allclose(found, [100.0, 40.0], rtol=0.03)

@@ -6,10 +6,11 @@ import pytest
 
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.suites import GroundConfig
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.rl.experiment import TaskConfig
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 GRASS = 3
 CONFIG = GroundConfig(train_worlds=3, suite_worlds=2, starts=6, pairs=4)
@@ -18,7 +19,7 @@ CONFIG = GroundConfig(train_worlds=3, suite_worlds=2, starts=6, pairs=4)
 def plane(slope_deg: float, size: int = 17) -> terrain_map.TerrainMap:
     """A plane that rises eastwards."""
     rise = np.tan(np.radians(slope_deg)) * np.arange(float(size))
-    return terrain_map.build(np.broadcast_to(rise, (size, size)), np.full((2, 2), GRASS))
+    return TerrainMap.from_array(np.broadcast_to(rise, (size, size)), np.full((2, 2), GRASS))
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +96,7 @@ def test_tasks_cross_every_world_and_start_anywhere(procedural):
     assert np.bincount(np.asarray(across.world)).tolist() == [4] * 6
     np.testing.assert_allclose(np.linalg.norm(across.start, axis=-1), 60, rtol=1e-5)
     np.testing.assert_allclose(across.goal, -np.asarray(across.start), atol=1e-3)
-    tasks = suites.training_tasks(CONFIG, train, hmmwv(), jax.random.key(1))
+    tasks = suites.training_tasks(CONFIG, train, load_vehicle(), jax.random.key(1))
     assert tasks.start.shape == (6 + 3 * 4, 2)
     assert (np.abs(np.asarray(tasks.start)) < 64).all()
     small = suites.test_tasks(CONFIG, plane(0))

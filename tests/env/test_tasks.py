@@ -7,7 +7,7 @@ from env.worlds import ground, hills, task
 from vertiwm_jax.env import tasks
 from vertiwm_jax.env.tasks import RandomTaskConfig
 from vertiwm_jax.env.termination import edge_distance
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import obstacles
 
@@ -62,7 +62,7 @@ def test_random_tasks_are_acceptable_and_varied():
     blocks = np.array([[x, y, 6, 6, 3] for x in (-30, 0, 30) for y in (-30, 0, 30)])
     terrain = terrain_map.stack([ground(relief, blocks), ground(relief.T.copy(), blocks)])
     config = RandomTaskConfig(steepest_start=0.4, roughest_start=0.45)
-    pool = tasks.random_tasks(jax.random.key(0), terrain, 200, hmmwv(), config)
+    pool = tasks.random_tasks(jax.random.key(0), terrain, 200, load_vehicle(), config)
     assert np.bincount(pool.world).tolist() == [100, 100]
     offset = np.asarray(pool.goal - pool.start)
     distance = np.linalg.norm(offset, axis=-1)
@@ -71,7 +71,7 @@ def test_random_tasks_are_acceptable_and_varied():
     assert np.abs((error + np.pi) % (2 * np.pi) - np.pi).max() <= np.pi / 3 + 1e-5
     for xy in (pool.start, pool.goal):
         assert edge_distance(terrain, xy).min() >= 4.0
-        size = hmmwv().length + 2, hmmwv().width + 2
+        size = load_vehicle().length + 2, load_vehicle().width + 2
         assert not obstacles.collides(terrain, xy, pool.yaw, *size).any()
     # The slope of the plane under the wheels, from heights read with NumPy.
     for world in (0, 1):
@@ -90,7 +90,7 @@ def test_random_tasks_are_acceptable_and_varied():
 def test_impossible_random_tasks_say_why():
     with pytest.raises(ValueError, match=r"for 3 of 3 tasks, on worlds \[0\]"):
         config = RandomTaskConfig(distance=(500.0, 600.0))
-        tasks.random_tasks(jax.random.key(0), ground(), 3, hmmwv(), config)
+        tasks.random_tasks(jax.random.key(0), ground(), 3, load_vehicle(), config)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ from vertiwm_jax.env.task import NavigationConfig, TaskParams
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.mechanics.kinematic import BicycleParams, KinematicBicycle
 from vertiwm_jax.state import Command, VehicleState
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.map import TerrainMap
 
 BICYCLE = BicycleParams(
@@ -39,7 +38,7 @@ def ground(elevation: np.ndarray | None = None, obstacles: Any = None) -> Terrai
     """Grass, 128 m x 128 m about (0, 0); flat unless `elevation` is given."""
     if elevation is None:
         elevation = np.zeros((129, 129))
-    return terrain_map.build(elevation, np.full((16, 16), GRASS), obstacles=obstacles)
+    return TerrainMap.from_array(elevation, np.full((16, 16), GRASS), obstacles=obstacles)
 
 
 def task(start: Any, goal: Any, yaw: float = 0.0) -> Tasks:

@@ -10,14 +10,14 @@ from vertiwm_jax.adaptation.soil_filter import SoilFilter
 from vertiwm_jax.evaluation import adaptation
 from vertiwm_jax.learning.dataset import Drives, WheelSignals
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import GRAVITY, hmmwv
+from vertiwm_jax.mechanics.vehicle import GRAVITY, load_vehicle
 from vertiwm_jax.mechanics.wheel import Wheel
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import query
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import PRESETS, to_unit
 
 MUD = 7
-TERRAIN = terrain_map.build(np.full((65, 65), 4.0), np.full((8, 8), MUD))
+TERRAIN = TerrainMap.from_array(np.full((65, 65), 4.0), np.full((8, 8), MUD))
 STEPS = 80
 
 
@@ -77,7 +77,7 @@ def test_wrong_soils_are_those_of_soft_ground_alone():
 
 
 def test_behaviour_is_that_under_a_quarter_of_the_weight():
-    params, soil = chrono_like(hmmwv()), PRESETS["sand"]
+    params, soil = chrono_like(load_vehicle()), PRESETS["sand"]
     vehicle = params.vehicle
     sinkage, pull = adaptation.behaviour(params, soil)
     stiff = replace(soil, kc=1.8 * soil.kc, kphi=1.8 * soil.kphi)
@@ -99,7 +99,7 @@ def test_recovery_tells_what_the_soil_does():
     count[0, -1, MUD] = 9
     soils = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 3, *x.shape)), query.soils(TERRAIN))
     adapted = adaptation.Adapted(soils, count, 0 * count, 8)
-    (row,) = adaptation.recovery(chrono_like(hmmwv()), TERRAIN, wrong, adapted)
+    (row,) = adaptation.recovery(chrono_like(load_vehicle()), TERRAIN, wrong, adapted)
     assert row["soil"] == "mud" and row["drives"] == "1" and row["measurements, refused"] == "9, 0"
     true, _, before = row["sinkage, mm: true / wrong"].partition(" / ")
     assert float(true) < 0.5 * float(before)

@@ -11,7 +11,7 @@ from vertiwm_jax.evaluation import calibration
 from vertiwm_jax.evaluation.calibration import LEVELS, Calibration
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning.windows import Windows
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 
 def errors(seed, count=40_000):
@@ -106,7 +106,7 @@ def standing(windows=3, context=2, horizon=4):
     state[:, -1, 0] = 1 + np.arange(windows)
     control = np.zeros((windows, context + horizon, 2), np.float32)
     none = np.zeros(windows, np.int32)
-    ground = terrain_map.build(np.zeros((65, 65)), np.full((8, 8), 3))
+    ground = TerrainMap.from_array(np.zeros((65, 65)), np.full((8, 8), 3))
     arrays = (jnp.asarray(x) for x in (state, control, none, none))
     return TestWindows(Windows(*arrays, context), none, ground)
 

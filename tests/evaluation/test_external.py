@@ -14,11 +14,11 @@ from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason as Reason
 from vertiwm_jax.evaluation import external
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.registry import load_encoders
 from vertiwm_jax.simulators import processes
 from vertiwm_jax.simulators.builtin import BuiltIn
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -27,7 +27,7 @@ def test_the_built_in_simulator_outside_jit_is_that_inside(jobs):
     semantic = np.full((16, 16), SNOW)
     semantic[:, 8:] = 0
     box = np.array([[15.0, -30.0, 4, 4, 3]])
-    terrain = terrain_map.build(hills(), semantic, obstacles=box)
+    terrain = TerrainMap.from_array(hills(), semantic, obstacles=box)
     tasks = Tasks(
         world=jnp.zeros(3, jnp.int32),
         start=jnp.array([[-20.0, 0.0], [0.0, -30.0], [50.0, 0.0]]),
@@ -36,7 +36,7 @@ def test_the_built_in_simulator_outside_jit_is_that_inside(jobs):
     )
     config = NavigationConfig(speed_range=(0.0, 5.0), horizon_seconds=6.0, embeddings=True)
     env = NavigationEnv(Simulator(), config)
-    params = env.make_params(chrono_like(hmmwv()), terrain, tasks, encoders=load_encoders())
+    params = env.make_params(chrono_like(load_vehicle()), terrain, tasks, encoders=load_encoders())
     arguments = env, params, jax.tree_util.Partial(led_by_embedding), jax.random.key(0)
     inside = run_episodes(*arguments)
     with processes.simulating(jobs) as mapped:

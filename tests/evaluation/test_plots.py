@@ -7,6 +7,7 @@ from env.worlds import GRASS, SNOW, ground, hills
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import picture
+from vertiwm_jax.terrain.map import TerrainMap
 
 
 def test_hills_are_lit_from_the_north_west_and_classes_tinted():
@@ -14,11 +15,11 @@ def test_hills_are_lit_from_the_north_west_and_classes_tinted():
     ridge = np.broadcast_to(8 - np.abs(x - 64) / 8, (129, 129))  # runs south to north
     semantic = np.full((16, 16), GRASS)
     semantic[:8, :8] = SNOW
-    shaded = picture.shaded(terrain_map.build(ridge, semantic), 0, enlarge=2)
+    shaded = picture.shaded(TerrainMap.from_array(ridge, semantic), 0, enlarge=2)
     assert shaded.shape == (256, 256, 3) and shaded.min() >= 0 and shaded.max() <= 1
     assert shaded[200, 40].sum() > shaded[200, 216].sum()  # western flank, eastern flank
     assert shaded[40, 40, 2] > shaded[200, 40, 2] + 0.1  # snow north-west, grass south-west
-    turned = picture.shaded(terrain_map.build(ridge.T, semantic), 0, enlarge=2)
+    turned = picture.shaded(TerrainMap.from_array(ridge.T, semantic), 0, enlarge=2)
     assert turned[40, 200].sum() > turned[216, 200].sum()  # northern flank, southern flank
 
 
@@ -55,7 +56,7 @@ def test_trajectories_show_every_drive():
 def test_maps_are_shown_with_a_legend_of_their_ground():
     semantic = np.full((16, 16), GRASS)
     semantic[0, 0] = SNOW
-    snowy = terrain_map.build(hills(), semantic)
+    snowy = TerrainMap.from_array(hills(), semantic)
     figure = terrain_map.stack([ground(obstacles=[[0, 0, 4, 4, 2]]), snowy]).plot(["plain", "hill"])
     assert [axes.get_title() for axes in figure.axes] == ["plain", "hill"]
     said = [text.get_text() for text in figure.legends[0].get_texts()]

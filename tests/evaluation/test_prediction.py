@@ -11,13 +11,14 @@ from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 DRIVES = Path(__file__).parents[1] / "data" / "chrono_drives"
 CONTEXT, HORIZON = 4, 6
-GROUND = terrain_map.build(np.zeros((65, 65)), np.full((8, 8), 3))
+GROUND = TerrainMap.from_array(np.zeros((65, 65)), np.full((8, 8), 3))
 
 
 def straight(windows: int = 5) -> Windows:
@@ -172,7 +173,7 @@ def test_errors_are_told_after_any_number_of_steps():
 def test_error_is_found_where_it_is():
     semantic = np.full((16, 16), 3)
     semantic[:, 8:] = terrain_map.STANDARD.names.index("mud")  # east of x = 0
-    terrain = terrain_map.build(np.zeros((65, 65)), semantic)
+    terrain = TerrainMap.from_array(np.zeros((65, 65)), semantic)
     windows = straight(4)
     x = jnp.array([-20.0, -3.0, 0.5, 20.0])
     windows = windows.replace(state=windows.state.at[..., 0].add(x[:, None]))
@@ -201,7 +202,7 @@ def test_error_is_found_where_it_is():
 def test_the_built_in_simulator_beats_both_baselines_on_chrono_drives():
     drives, terrain = dataset.load_drives(DRIVES, "train")
     test = TestWindows.of(drives, terrain, context=16, horizon=16, stride=16)
-    vehicle = hmmwv()
+    vehicle = load_vehicle()
     models = (
         (Simulator(), chrono_like(vehicle)),
         (KinematicBicycle(), bicycle_of(vehicle)),
@@ -221,9 +222,9 @@ def test_the_built_in_simulator_beats_both_baselines_on_chrono_drives():
 
 def test_predictions_are_of_the_selected_worlds():
     rise = np.tile(0.2 * (np.arange(65) - 32.0), (65, 1)) + 8
-    terrain = terrain_map.stack([GROUND, terrain_map.build(rise, np.full((8, 8), 3))])
+    terrain = terrain_map.stack([GROUND, TerrainMap.from_array(rise, np.full((8, 8), 3))])
     windows = straight(2).replace(world=jnp.array([0, 1]))
     test = TestWindows(windows, np.arange(2), terrain)
-    final = prediction.predict(KinematicBicycle(), bicycle_of(hmmwv()), test).states
+    final = prediction.predict(KinematicBicycle(), bicycle_of(load_vehicle()), test).states
     assert float(final.rpy[0, -1, 1]) == pytest.approx(0.0, abs=1e-6)
     assert float(final.rpy[1, -1, 1]) == pytest.approx(-np.arctan(0.2), abs=1e-4)

@@ -8,6 +8,7 @@ from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.evaluation.prediction_report import AROUND
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 CONTEXT, HORIZON = 2, 16
 
@@ -15,7 +16,7 @@ CONTEXT, HORIZON = 2, 16
 def test_coefficients_are_aligned_where_the_vehicle_crosses_a_border():
     semantic = np.full((16, 16), 3)
     semantic[:, 8:] = terrain_map.STANDARD.names.index("mud")  # east of x = 0
-    terrain = terrain_map.build(np.zeros((65, 65)), semantic)
+    terrain = TerrainMap.from_array(np.zeros((65, 65)), semantic)
     # Four windows at 1 m a step: onto soil in the sixth and in the tenth step, off it in the
     # eighth, and never.
     x = jnp.arange(-CONTEXT, HORIZON + 1.0)

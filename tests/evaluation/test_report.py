@@ -10,6 +10,7 @@ from vertiwm_jax.env.episodes import NavigationResult
 from vertiwm_jax.env.termination import TerminationReason as Reason
 from vertiwm_jax.evaluation import report
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 SUITES = ["hard", "easy", "hard"]
 WORLD = [0, 0, 1, 1, 2, 2]
@@ -81,7 +82,9 @@ def test_the_reference_alone_is_compared_with_nothing(groups):
 
 
 def test_everything_is_written(groups, tmp_path):
-    terrain = terrain_map.stack([terrain_map.build(np.zeros((65, 65)), np.zeros((8, 8), int))] * 3)
+    terrain = terrain_map.stack(
+        [TerrainMap.from_array(np.zeros((65, 65)), np.zeros((8, 8), int))] * 3
+    )
     report.write(tmp_path / "new", groups, "straight", terrain, 8.0)
     left = {path.name for path in (tmp_path / "new").iterdir()}
     pictures = {"trajectories_hard.png", "trajectories_easy.png"}

@@ -18,7 +18,7 @@ from vertiwm_jax.learning import experiment as fitting
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 GRASS = 3
 TESTS = Path(__file__).resolve().parents[1]
@@ -35,7 +35,7 @@ def begin(*_, **__):
 def maps(folder, size, count=1):
     folder.mkdir()
     for i in range(count):
-        level = terrain_map.build(np.ones((size, size)), np.full((4, 4), GRASS))
+        level = TerrainMap.from_array(np.ones((size, size)), np.full((4, 4), GRASS))
         files.save(level, folder / f"map_{i}.npz")
     return folder
 

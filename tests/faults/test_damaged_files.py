@@ -18,8 +18,7 @@ from vertiwm_jax.importers import rosbag, table
 from vertiwm_jax.importers.settings import Table, Topics
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.terrain import files, vertibench
-from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain.map import MapError
+from vertiwm_jax.terrain.map import MapError, TerrainMap
 
 GRASS = 3
 BAG = replace(SETTINGS, rosbag=Topics("/odom", "/cmd"))
@@ -34,7 +33,7 @@ FLIPPED = 0x55
 def good(tmp_path):
     """A map that can be read."""
     heights = 5 + np.random.default_rng(0).random((21, 21))
-    files.save(terrain_map.build(heights, np.full((4, 4), GRASS)), tmp_path / "map.npz")
+    files.save(TerrainMap.from_array(heights, np.full((4, 4), GRASS)), tmp_path / "map.npz")
     files.load_map(tmp_path / "map.npz")
     return tmp_path / "map.npz"
 
@@ -115,7 +114,8 @@ def test_a_map_may_be_cut_off_anywhere(good):
 def test_a_map_may_have_other_names(good, name):
     arrays = dict(np.load(good))
     np.savez(good, **{f"the_{key}" if key == name else key: x for key, x in arrays.items()})
-    assert f"{good}: {name}: expected" in refusal(lambda: files.load_map(good), MapError)
+    message = refusal(lambda: files.load_map(good), MapError)
+    assert message.startswith(f"{good}: file: expected") and f"{name} is not a file" in message
 
 
 def meta(whole, **changes):

@@ -13,8 +13,7 @@ from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.importers import grid_map
 from vertiwm_jax.importers.settings import Frames, GridMapSettings
 from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain.map import MapError
+from vertiwm_jax.terrain.map import MapError, TerrainMap
 
 SIZE = 65
 HEIGHTS = hills(SIZE, height=0.3)
@@ -23,7 +22,7 @@ NEAR, FAR = (0.0, 0.0), (512345.0, 5234567.0)
 
 
 def built(folder, origin):
-    return terrain_map.build(HEIGHTS, np.full((8, 8), GRASS), origin=origin)
+    return TerrainMap.from_array(HEIGHTS, np.full((8, 8), GRASS), origin=origin)
 
 
 def saved(folder, origin):

@@ -13,7 +13,7 @@ from vertiwm_jax.deploy import description, onnx_graph, run_policy, stablehlo
 from vertiwm_jax.env.controllers import LookAhead
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.networks.policy import Actor, ObservationLayout
 from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy
 from vertiwm_jax.rl.running_statistics import RunningStatistics
@@ -36,7 +36,10 @@ def act(request, policy):
     if request.param == "stablehlo":
         made = stablehlo.policy(lambda seen: policy(seen, jax.random.key(0)), OBSERVATION_SIZE)
         return jax.export.deserialize(bytearray(made)).call
-    about, weights = description.about(policy, CONFIG, hmmwv(), 4), description.weights(policy)
+    about, weights = (
+        description.about(policy, CONFIG, load_vehicle(), 4),
+        description.weights(policy),
+    )
     made = onnx_graph.record(partial(run_policy.act, about, weights), OBSERVATION_SIZE, 2)
     session = onnxruntime.InferenceSession(made, providers=["CPUExecutionProvider"])
     return lambda seen: session.run(["action"], {"observation": seen})[0]

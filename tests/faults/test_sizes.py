@@ -15,8 +15,7 @@ from vertiwm_jax.importers import grid_map
 from vertiwm_jax.importers.settings import Frames, GridMapSettings
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain import map as terrain_map
-from vertiwm_jax.terrain.map import MapError
+from vertiwm_jax.terrain.map import MapError, TerrainMap
 
 GIB = 2**30
 GRASS = 3
@@ -68,7 +67,7 @@ def npy(folder):
 
 
 def npz(folder):
-    files.save(terrain_map.build(np.ones((9, 9)), np.full((2, 2), GRASS)), folder / "good.npz")
+    files.save(TerrainMap.from_array(np.ones((9, 9)), np.full((2, 2), GRASS)), folder / "good.npz")
     with (
         zipfile.ZipFile(folder / "good.npz") as good,
         zipfile.ZipFile(folder / "map.npz", "w") as bad,

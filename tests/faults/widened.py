@@ -19,16 +19,16 @@ from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, rollout
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.tasks import circle_tasks
-from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of, rest_on_ground
+from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of, place
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.registry import load_model
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
 from vertiwm_jax.rl.td3 import TD3, TD3Config
 from vertiwm_jax.state import Command, VehicleState
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import worlds
+from vertiwm_jax.terrain.map import TerrainMap
 
 COLLECTED = {"total_timesteps": 64, "num_envs": 8, "num_steps": 8, "hidden": (8,)}
 REPLAYED = COLLECTED | {"updates": 1, "batch": 8, "buffer_size": 64, "learning_starts": 64}
@@ -36,17 +36,8 @@ REPLAYED = COLLECTED | {"updates": 1, "batch": 8, "buffer_size": 64, "learning_s
 
 def drive(model: Dynamics, params: Any) -> VehicleState:
     """Half a second as the README drives, without compiling it."""
-    terrain = terrain_map.build(np.zeros((41, 41)), np.full((4, 4), GRASS))
-    vehicle = hmmwv()
-    position, rpy = rest_on_ground(
-        terrain,
-        jnp.zeros(2),
-        jnp.float32(0),
-        vehicle.wheelbase,
-        vehicle.track,
-        vehicle.wheel_radius,
-    )
-    start = VehicleState(position, rpy, jnp.zeros(3), jnp.zeros(3))
+    terrain = TerrainMap.from_array(np.zeros((41, 41)), np.full((4, 4), GRASS))
+    start = place(terrain)
     commands = Command(jnp.full(5, 3.0), jnp.full(5, 0.1))
     return jax.eval_shape(
         lambda params: rollout(model, params, terrain, start, commands),
@@ -65,8 +56,8 @@ def learn(algorithm: Callable[[NavigationEnv], Any]) -> Any:
 
 CASES = {
     "worlds": lambda: worlds.generate(jax.random.split(jax.random.key(0), 1), worlds.WorldConfig()),
-    "bicycle": lambda: drive(KinematicBicycle(), bicycle_of(hmmwv())),
-    "simulator": lambda: drive(Simulator(), chrono_like(hmmwv())),
+    "bicycle": lambda: drive(KinematicBicycle(), bicycle_of(load_vehicle())),
+    "simulator": lambda: drive(Simulator(), chrono_like(load_vehicle())),
     "shipped weights": lambda: drive(*load_model("vertiwm")),
     "gymnax": lambda: gymnax.make(vertiwm_jax.gym.GYMNAX_NAME, model="builtin", number=1, starts=4)[
         1

@@ -41,7 +41,6 @@ from vertiwm_jax.rl.sac import SAC, SACConfig
 from vertiwm_jax.rl.td3 import TD3, TD3Config
 from vertiwm_jax.runs import Run
 from vertiwm_jax.state import Command, VehicleState
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import BOUNDS
@@ -103,7 +102,7 @@ def ground() -> TerrainMap:
     bumps = 0.15 * np.sin(1.3 * x) * np.cos(1.1 * y)
     elevation = 4 + 1.5 * np.sin(x / 9) + np.cos(y / 7) + bumps
     boxes = [[-21.0, 24.0, 3.0, 2.0, 2.0], [12.0, 4.0, 2.0, 2.0, 1.5]]
-    return terrain_map.build(elevation, (cell + 3 * cell[:, None]) % 10, obstacles=boxes)
+    return TerrainMap.from_array(elevation, (cell + 3 * cell[:, None]) % 10, obstacles=boxes)
 
 
 def starts() -> VehicleState:

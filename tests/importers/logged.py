@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from vertiwm_jax.importers.settings import ImportSettings, VehicleSettings
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 VEHICLE = VehicleSettings(wheelbase=2.0, track=1.2)
 SETTINGS = ImportSettings(vehicle=VEHICLE)
@@ -93,7 +94,7 @@ def logged(
 
 def terrain() -> terrain_map.TerrainMap:
     """Level ground of 60 m by 60 m below the drive."""
-    return terrain_map.build(np.full((61, 61), -1.0), np.full((8, 8), 3))
+    return TerrainMap.from_array(np.full((61, 61), -1.0), np.full((8, 8), 3))
 
 
 def errors(found: np.ndarray, time: np.ndarray) -> np.ndarray:

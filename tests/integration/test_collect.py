@@ -15,14 +15,14 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.mechanics import vehicle
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.registry import load_encoders
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.simulators import chrono, collection, excitation
 from vertiwm_jax.simulators.driving import Drive
 from vertiwm_jax.simulators.protocol import Observation, SimulatorError
 from vertiwm_jax.terrain import files, query
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.sensing import SensingConfig
 
 GRASS, SAND = 3, 8
@@ -38,7 +38,7 @@ def maps(tmp_path_factory):
     semantic[:, 8:] = SAND
     for i in range(2):
         heights = 4 + i * np.outer(wave, wave)
-        files.save(terrain_map.build(heights, semantic), folder / f"map_{i}.npz")
+        files.save(TerrainMap.from_array(heights, semantic), folder / f"map_{i}.npz")
     return folder
 
 
@@ -155,7 +155,7 @@ def test_drives_that_end_early_are_tried_again(maps, monkeypatch):
 
     monkeypatch.setattr(collection, "record", short)
     command = collection.CollectConfig(output=maps, seconds=1.0)
-    task = collection.Task(command, hmmwv(), None, files.load_map(maps), world=0, drive=0)
+    task = collection.Task(command, load_vehicle(), None, files.load_map(maps), world=0, drive=0)
     assert len(collection.record_task(task).control) == 3 and len(set(tried)) == 6
     with pytest.raises(SimulatorError, match="world 0: drive 0: expected a step or more"):
         collection.record_task(task)
@@ -194,7 +194,7 @@ def test_endings(maps, tmp_path, index, value, ending, length):
     assert (drive.ending, len(drive.control), len(drive.observations)) == (
         ending, length, length + 1,
     )  # fmt: skip
-    collection.write(tmp_path / "a.npz", [drive], 5, {"map": "a"}, hmmwv())
+    collection.write(tmp_path / "a.npz", [drive], 5, {"map": "a"}, load_vehicle())
     file = np.load(tmp_path / "a.npz")
     assert file["length"] == [length] and file["state"].shape == (1, 6, 12)
     assert json.loads(str(file["meta"]))["dt"] == 0.1
@@ -205,7 +205,7 @@ def test_starts_are_level_roomy_and_near_borders(maps):
     steep = np.broadcast_to(np.maximum(np.arange(129.0) - 100, 0) * 0.5, (129, 129))
     semantic = np.full((16, 16), GRASS)
     semantic[:, 6:8] = SAND
-    terrain = terrain_map.build(steep, semantic, obstacles=boxes)
+    terrain = TerrainMap.from_array(steep, semantic, obstacles=boxes)
     for seed in range(20):
         x, y, yaw = excitation.start(np.random.default_rng(seed), terrain, 16.0)
         assert abs(x) <= 59 and abs(y) <= 59 and x < 38
@@ -215,7 +215,7 @@ def test_starts_are_level_roomy_and_near_borders(maps):
         way = np.linspace(x, end[0], 50)
         assert 0.05 < np.mean((way > -16) & (way < 0)) < 0.95
     slope = np.broadcast_to(0.4 * np.arange(65.0), (65, 65))
-    steep = terrain_map.build(slope, np.full((8, 8), GRASS))
+    steep = TerrainMap.from_array(slope, np.full((8, 8), GRASS))
     with pytest.raises(SimulatorError, match="20 degrees or less"):
         excitation.start(np.random.default_rng(0), steep, 16.0)
 
@@ -246,7 +246,9 @@ def test_a_policy_drives_from_goal_to_goal(maps, encoders):
     size = OBSERVATION_SIZE + (math.prod(EMBEDDING_SHAPE) if encoders else 0)
     policy = jax.tree_util.Partial(AtGoal(size))
     rng = np.random.default_rng(0)
-    pilot = collection.to_goals(policy, config, encoders, hmmwv(), terrain, (0.0, 0.0, 0.0), rng)
+    pilot = collection.to_goals(
+        policy, config, encoders, load_vehicle(), terrain, (0.0, 0.0, 0.0), rng
+    )
     height = float(query.height(terrain, jnp.zeros(2)))
     state, goals = np.array([0, 0, height, *np.zeros(9)], np.float32), []
     for _ in range(3):
@@ -261,7 +263,7 @@ def test_a_policy_drives_from_goal_to_goal(maps, encoders):
     assert np.linalg.norm(np.diff(goals, axis=0), axis=-1).min() >= 20
     command = collection.CollectConfig(output=maps, seconds=2.0)
     alone = jax.device_get(terrain.subset(np.array([0])))
-    task = collection.Task(command, hmmwv(), (policy, config, encoders), alone, 0, drive=1)
+    task = collection.Task(command, load_vehicle(), (policy, config, encoders), alone, 0, drive=1)
     drive = collection.record_task(task)
     assert drive.control.shape == (20, 2) and np.all(drive.control[:, 0] == 2.5)
 
@@ -270,7 +272,7 @@ def test_a_policy_sees_as_far_as_it_did_in_training():
     """Of hills, one that sees 12 m observes what the level ground around it suggests."""
     hills = np.zeros((129, 129))
     hills[:, 80:] = 3.0
-    terrain = terrain_map.build(hills, np.full((16, 16), GRASS))
+    terrain = TerrainMap.from_array(hills, np.full((16, 16), GRASS))
     heights, way = LAYOUT["height"].where, LAYOUT["route"].where
     policy = jax.tree_util.Partial(
         lambda seen, key: jnp.stack([seen[heights].mean(), seen[way.start] / 10])
@@ -279,7 +281,9 @@ def test_a_policy_sees_as_far_as_it_did_in_training():
     acted = {}
     for sight in (12.0, np.inf):
         config = NavigationConfig(sensing=SensingConfig(range=sight))
-        pilot = collection.to_goals(policy, config, None, hmmwv(), terrain, state[[0, 1, 5]], Ahead)
+        pilot = collection.to_goals(
+            policy, config, None, load_vehicle(), terrain, state[[0, 1, 5]], Ahead
+        )
         pilot(state)
         assert (pilot.state.observed is None) == np.isinf(sight)
         acted[sight] = np.asarray(pilot._action)
@@ -290,7 +294,7 @@ def test_a_policy_sees_as_far_as_it_did_in_training():
 
 def test_a_rover_drives_at_full_size(maps, tmp_path):
     # The ground of the maps is so small to it that it is 1280 m at full size.
-    flat = terrain_map.build(np.full((129, 129), 0.3), np.full((16, 16), SAND))
+    flat = TerrainMap.from_array(np.full((129, 129), 0.3), np.full((16, 16), SAND))
     (tmp_path / "maps").mkdir()
     files.save(flat, tmp_path / "maps" / "map.npz")
     run(tmp_path / "maps", tmp_path / "drives", "--vehicle", "rover", "--drives", "1")

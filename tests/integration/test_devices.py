@@ -20,7 +20,7 @@ from vertiwm_jax.learning.fitting import Fit, FitConfig, FitInputs
 from vertiwm_jax.learning.objectives import RolloutLoss
 from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
 from vertiwm_jax.training import Seeds
@@ -205,7 +205,7 @@ def test_fitting_on_two_devices_is_fitting_on_one(two):
     config = WindowConfig(batch=16, context=2, horizon=4, validation=9)
     drives, terrain = dataset.load_drives([OPEN / "rigid"], "validation")
     drives = jax.tree.map(lambda x: x[:1], replace(drives, wheels=WheelSignals()))
-    model, params = KinematicBicycle(), bicycle_of(hmmwv())
+    model, params = KinematicBicycle(), bicycle_of(load_vehicle())
     data = WindowData.of(config, (drives, terrain), (drives, terrain))
     problem = WindowProblem(model, RolloutLoss(model), config)
     fit = Fit(problem, FitConfig(updates=4, updates_per_iteration=4, warm_up=1))

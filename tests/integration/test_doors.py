@@ -29,7 +29,7 @@ from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.sensing import SensingConfig
 
 GRASS = 3
@@ -403,7 +403,7 @@ def maps(folder, count):
     folder.mkdir()
     for i in range(count):
         elevation = np.broadcast_to(0.05 * i * np.arange(129.0), (129, 129))
-        terrain = terrain_map.build(elevation, np.full((16, 16), GRASS))
+        terrain = TerrainMap.from_array(elevation, np.full((16, 16), GRASS))
         files.save(terrain, folder / f"map_{i}.npz")
 
 

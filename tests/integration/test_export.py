@@ -21,7 +21,7 @@ from vertiwm_jax.env.controllers import LookAhead, StraightToGoal
 from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.registry import load_encoders
 from vertiwm_jax.networks.policy import Actor, ObservationLayout, TanhNormalActor
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
@@ -30,7 +30,7 @@ from vertiwm_jax.rl.experiment import SACTraining
 from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.state import VehicleState
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.sensing import SensingConfig
 
 CONFIG = NavigationConfig(speed_range=(-1.0, 5.0))
@@ -93,7 +93,7 @@ def in_onnx(model, seen):
 
 def written(policy, folder):
     """The files of a policy, as on a robot, and the policy in NumPy."""
-    made = export.files(policy, None, CONFIG, hmmwv(), 8, onnx_graph.record)
+    made = export.files(policy, None, CONFIG, load_vehicle(), 8, onnx_graph.record)
     for name, data in made.items():
         atomic.write(folder / name, data)
     return made, run_policy.load(folder)
@@ -123,7 +123,7 @@ def test_all_forms_of_a_policy_agree(actor, base, tmp_path):
             assert found.dtype == np.float32
             assert np.all(np.abs(found - expected[some]) <= tolerance[some])
     np.testing.assert_allclose(in_numpy(seen[5]), expected[5], atol=1e-5)
-    command = hmmwv().command(jnp.asarray(expected), CONFIG.speed_range)
+    command = load_vehicle().command(jnp.asarray(expected), CONFIG.speed_range)
     speed, steering = in_numpy.command(expected)
     np.testing.assert_allclose(speed, command.speed, atol=1e-6)
     np.testing.assert_allclose(steering, command.steering, atol=1e-6)
@@ -160,7 +160,7 @@ class Robot:
 
 def test_the_robot_drives_as_the_test_does(tmp_path):
     policy = policy_of(ACTORS["ppo"], BASES["look ahead"])
-    terrain = terrain_map.build(hills(), np.full((16, 16), SNOW))
+    terrain = TerrainMap.from_array(hills(), np.full((16, 16), SNOW))
     config = NavigationConfig(speed_range=CONFIG.speed_range, horizon_seconds=4.0)
     env, params = bicycle_env(terrain, task((-20.0, 0.0), (20.0, 5.0)), config)
     key = jax.random.key(0)
@@ -175,7 +175,7 @@ def test_the_observation_of_map_arrays(size, sighted):
     semantic = np.full((16, 16), SNOW)
     semantic[:, 8:] = 0
     boxes = np.array([[18, 4, 2, 3, 1], [0, 0, 0, 0, 0]], np.float32)
-    terrain = terrain_map.build(hills(size), semantic, obstacles=boxes)
+    terrain = TerrainMap.from_array(hills(size), semantic, obstacles=boxes)
     arrays = (terrain.elevation, terrain.semantic, terrain.friction, terrain.obstacles)
     state = VehicleState.from_vector(jnp.array([15, 1, 2, 0.1, -0.2, 0.7, 3, 0, 0, 0, 0, 0.1]))
     goal, action = jnp.array([20.0, 5.0, 1.0]), jnp.array([0.3, -0.4])
@@ -183,21 +183,23 @@ def test_the_observation_of_map_arrays(size, sighted):
     observe, find_way, find_none = (
         jax.export.deserialize(bytearray(data)).call
         for data in (
-            stablehlo.observe(config, hmmwv(), encoders),
-            stablehlo.route(config, hmmwv()),
-            stablehlo.route(NavigationConfig(sensing=SensingConfig(range=12.0)), hmmwv()),
+            stablehlo.observe(config, load_vehicle(), encoders),
+            stablehlo.route(config, load_vehicle()),
+            stablehlo.route(NavigationConfig(sensing=SensingConfig(range=12.0)), load_vehicle()),
         )
     )
     arrays = (*(x[0] for x in arrays), terrain.origin, terrain.resolution)
     worlds = jnp.zeros(1, jnp.int32)
-    routes = route.plan(config.route, terrain, hmmwv(), worlds, goal[None, :2])
+    routes = route.plan(config.route, terrain, load_vehicle(), worlds, goal[None, :2])
     way = find_way(*arrays, goal)
     np.testing.assert_allclose(way, routes.cost[0], rtol=1e-5)
     straight = route.straight(config.route, terrain, goal[None, :2])
     np.testing.assert_allclose(find_none(*arrays, goal), straight.cost[0], rtol=1e-6)
     assert (way >= straight.cost[0] - 1e-3).all() and (way > 1.5 * straight.cost[0]).any()
     latents = jax.jit(embed)(encoders, terrain, state) if encoders else None
-    expected = jax.jit(observation.observe)(terrain, hmmwv(), state, goal, routes, action, latents)
+    expected = jax.jit(observation.observe)(
+        terrain, load_vehicle(), state, goal, routes, action, latents
+    )
     assert 0 < (observation.arcs_ahead(expected)[1] == 7.5).sum() < 72
     if encoders:
         assert float(jnp.std(expected[OBSERVATION_SIZE:])) > 0.1

@@ -14,7 +14,7 @@ from vertiwm_jax.cli import view
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity
 from vertiwm_jax.rl.experiment import SACTraining
 from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 TINY = """
 ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 2}
@@ -57,7 +57,7 @@ def test_a_recorded_drive(uniform, tmp_path, capsys, monkeypatch):
 
 
 def test_maps_are_drawn_beside_them(tmp_path, capsys):
-    level = terrain_map.build(np.zeros((33, 33)), np.full((4, 4), 3))
+    level = TerrainMap.from_array(np.zeros((33, 33)), np.full((4, 4), 3))
     for name in ("a", "b"):
         files.save(level, tmp_path / f"{name}.npz")
     for source, drawn in (("a.npz", "a.png"), ("", "maps.png")):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 STEPS, GRASS, SNOW = 40, 3, 9
 
@@ -32,7 +32,7 @@ def write(folder: Path, name: str = "a.npz", **changes: np.ndarray | None) -> Pa
     """A good file with some arrays replaced, or left out, and its map."""
     arrays = {**drives(), **changes}
     (folder / "maps").mkdir(exist_ok=True)
-    hill = terrain_map.build(np.ones((9, 9)), np.full((4, 4), GRASS))
+    hill = TerrainMap.from_array(np.ones((9, 9)), np.full((4, 4), GRASS))
     files.save(hill, folder / "maps" / "hill.npz")
     np.savez(folder / name, **{k: v for k, v in arrays.items() if v is not None})
     return folder / name

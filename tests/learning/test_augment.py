@@ -12,11 +12,11 @@ from vertiwm_jax.learning import augment, dataset
 from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.learning.windows import Windows, gather, index
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import obstacles, patches, query
-from vertiwm_jax.terrain.map import MapError
+from vertiwm_jax.terrain.map import MapError, TerrainMap
 
 DRIVES = Path(__file__).parents[1] / "data" / "chrono_drives"
 C = 4
@@ -28,13 +28,13 @@ def world(seed, **changes):
     boxes = np.array([[3, -2, 4, 1, 2.0], [7, 5, 1, 2, 3.0], [0, 0, 0, 0, 0]])
     arguments = {
         "elevation": rng.uniform(0, 8, (17, 17)),
-        "semantic": rng.integers(0, 10, (4, 4)),
+        "classes": rng.integers(0, 10, (4, 4)),
         "friction": rng.uniform(0.2, 0.9, (4, 4)),
         "obstacles": boxes,
         "origin": (-1.0, 10.0),
         **changes,
     }
-    return terrain_map.build(**arguments)
+    return TerrainMap.from_array(**arguments)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,6 @@ def across(xy):
 
 
 def test_the_mirrored_ground_is_the_ground_at_the_mirrored_place(both):
-    terrain_map.validate(both)
     xy = points()
     for world in (0, 1):
         here = query.surface(both.select(jnp.int32(world)), xy)
@@ -151,7 +150,7 @@ def test_the_simulator_drives_the_mirror_image_of_what_it_drives():
     drives, terrain = dataset.load_drives(DRIVES, "train")
     windows = gather(drives, index(drives, terrain, context=C, horizon=16, stride=20))
     both = augment.with_mirrored(terrain)
-    simulator, params = Simulator(), chrono_like(hmmwv())
+    simulator, params = Simulator(), chrono_like(load_vehicle())
 
     @jax.jit
     @jax.vmap

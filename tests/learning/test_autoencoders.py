@@ -18,8 +18,8 @@ from vertiwm_jax.learning.autoencoders import (
 from vertiwm_jax.learning.fitting import FitConfig
 from vertiwm_jax.networks.encoder import TerrainEncoder
 from vertiwm_jax.runs import Run
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import patches
+from vertiwm_jax.terrain.map import TerrainMap
 
 DRIVES = Path(__file__).parents[1] / "data" / "chrono_drives"
 CONFIG = AutoencoderConfig(batch=4, validation=8)
@@ -52,7 +52,7 @@ def test_places_are_those_of_the_valid_steps(recorded):
 
 def test_a_moved_vehicle_stays_on_the_map_as_high_above_the_ground():
     rise = np.tile(0.1 * np.arange(33.0), (33, 1)) + 4
-    terrain = terrain_map.build(rise, np.full((8, 8), 3))
+    terrain = TerrainMap.from_array(rise, np.full((8, 8), 3))
     position = jnp.array([2.0, -3.0, 7.0])
     for offset, xy in (((5.0, 1.0), (7, -2)), ((30.0, 1.0), (16, -2)), ((0.0, -30.0), (2, -16))):
         moved = autoencoders._move(terrain, position, jnp.array(offset))

@@ -7,7 +7,7 @@ from learning.recordings import STEPS, drives, wheel_signals, write
 
 from vertiwm_jax.learning import compact, dataset, windows
 from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 SHIPPED = Path(__file__).parents[2] / "data" / "open"
 KINDS = ("rigid", "deformable", "mixed")
@@ -22,7 +22,7 @@ def collections(folder: Path) -> Path:
         length = np.full(25, STEPS, np.int32)
         length[2] = 30
         write(folder / kind, state=state, length=length, driver=np.ones(9), **wheel_signals())
-        hill = terrain_map.build(rng.uniform(0, 9, (9, 9)), np.full((4, 4), 3))
+        hill = TerrainMap.from_array(rng.uniform(0, 9, (9, 9)), np.full((4, 4), 3))
         files.save(hill, folder / kind / "maps" / "hill.npz")
     (folder / "mixed" / "maps").rename(folder / "maps")
     return folder

@@ -7,9 +7,8 @@ from learning.recordings import GRASS, SNOW, STEPS, drives, wheel_signals, write
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
-from vertiwm_jax.terrain.map import MapError
+from vertiwm_jax.terrain.map import MapError, TerrainMap
 
 
 @pytest.mark.parametrize(
@@ -100,7 +99,7 @@ def test_missing_classes_are_those_of_the_map_under_the_wheels(tmp_path):
     state[..., 0] = np.linspace(-2, 2, STEPS + 1)
     write(tmp_path, state=state, wheel_class=None, meta=meta)
     semantic = np.where(np.arange(4) < 2, GRASS, SNOW) * np.ones((4, 1), int)
-    files.save(terrain_map.build(np.ones((9, 9)), semantic), tmp_path / "maps" / "hill.npz")
+    files.save(TerrainMap.from_array(np.ones((9, 9)), semantic), tmp_path / "maps" / "hill.npz")
     loaded, _ = dataset.load_drives(tmp_path, "test")
     east = state[22:, :, None, 0] - (np.array(wheels) @ [1, 1]) / np.sqrt(2)
     np.testing.assert_array_equal(loaded.wheel_class, np.where(east < 0, GRASS, SNOW))
@@ -111,7 +110,7 @@ def test_collections_are_loaded_together(tmp_path):
         (tmp_path / name).mkdir()
         write(tmp_path / name, "a.npz")
         write(tmp_path / name, "b.npz")
-        hill = terrain_map.build(np.full((9, 9), height), np.full((4, 4), GRASS))
+        hill = TerrainMap.from_array(np.full((9, 9), height), np.full((4, 4), GRASS))
         files.save(hill, tmp_path / name / "maps" / "hill.npz")
     loaded, terrain = dataset.load_drives([tmp_path / "rigid", tmp_path / "mixed"], "test")
     np.testing.assert_array_equal(loaded.world, np.repeat([0, 1, 2, 3], 3))
@@ -126,7 +125,7 @@ def test_collections_of_other_classes_are_refused(tmp_path):
     classes = GroundClasses(
         names, STANDARD.rgb, STANDARD.friction, STANDARD.friction_deviation, STANDARD.soils
     )
-    moss = terrain_map.build(np.ones((9, 9)), np.full((4, 4), GRASS), classes=classes)
+    moss = TerrainMap.from_array(np.ones((9, 9)), np.full((4, 4), GRASS), ground=classes)
     files.save(moss, tmp_path / "own" / "maps" / "hill.npz")
     with pytest.raises(MapError, match="class_names: expected") as caught:
         dataset.load_drives([tmp_path / "own", tmp_path / "standard"], "test")

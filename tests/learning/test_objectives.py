@@ -16,7 +16,7 @@ from vertiwm_jax.learning.losses import LossConfig, step_loss, trajectory_loss
 from vertiwm_jax.learning.objectives import RolloutLoss, TeacherForcingLoss
 from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.runs import Run
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import MapError
@@ -70,7 +70,7 @@ def test_open_loop_starts_where_the_context_ends():
 
 def test_open_loop_is_a_step_after_the_other(data):
     one = jax.tree.map(lambda x: x[7], data.validation)
-    terrain, params = data.validation_terrain.select(one.world), bicycle_of(hmmwv())
+    terrain, params = data.validation_terrain.select(one.world), bicycle_of(load_vehicle())
     state = VehicleState.from_vector(one.state[CONFIG.context])
     found, _ = objectives.open_loop(BICYCLE, params, terrain, one, lambda _: None)
     step = jax.jit(BICYCLE.step)
@@ -138,7 +138,7 @@ def test_batches_are_of_mirrored_windows_as_often_as_not(data, recorded):
 
 
 def test_validation_is_the_error_of_the_tables(data):
-    params = bicycle_of(hmmwv())
+    params = bicycle_of(load_vehicle())
     problem = WindowProblem(BICYCLE, RolloutLoss(BICYCLE), CONFIG)
     found = jax.jit(problem.validate)(params, data)
     drive = np.arange(len(data.validation.world))
@@ -191,7 +191,7 @@ def test_a_bicycle_learns_from_chrono(data, tmp_path):
         weight_decay=0.0,
         trainable=("ride_height", "speed_lag"),
     )
-    params = replace(bicycle_of(hmmwv()), ride_height=jnp.float32(0.8))
+    params = replace(bicycle_of(load_vehicle()), ride_height=jnp.float32(0.8))
     problem = WindowProblem(BICYCLE, RolloutLoss(BICYCLE), CONFIG)
     run = Run.create(tmp_path, "fit", config)
     fitted = fitting.fit(problem, config, params, data, jax.random.key(0), run)

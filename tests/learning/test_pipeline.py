@@ -10,7 +10,7 @@ from learning import recordings
 from vertiwm_jax.learning import pipeline, stages
 from vertiwm_jax.learning.pipeline import PipelineConfig
 from vertiwm_jax.mechanics import vehicle
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models import files
 from vertiwm_jax.models.config import ModelConfig
 from vertiwm_jax.runs import Run
@@ -28,7 +28,7 @@ def test_a_fit_that_goes_on_keeps_its_vehicle_unless_told(tmp_path, monkeypatch)
     monkeypatch.setattr(stages, "fit", nothing_learned)
     recordings.write(tmp_path)
     start, run = files.load(files.PRETRAINED)[1], Run(tmp_path, None)
-    for name, driven in ((None, hmmwv()), ("rover", vehicle.load("rover").vehicle)):
+    for name, driven in ((None, load_vehicle()), ("rover", vehicle.load("rover").vehicle)):
         config = PipelineConfig(model=NESAM, vehicle=name)
         fitted = pipeline.fit(config, [tmp_path], jax.random.key(0), run, start=start)
         chex.assert_trees_all_equal(fitted.vehicle, driven)

@@ -11,6 +11,7 @@ from vertiwm_jax.networks.encoder import LATENT_CHANNELS
 from vertiwm_jax.networks.soil_predictor import SoilPredictor
 from vertiwm_jax.perception.features import init_pair
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import BOUNDS, PRESETS, to_unit
 
 NAMES = terrain_map.STANDARD.names
@@ -28,7 +29,7 @@ def params():
 def data(*kinds):
     """One flat world of each kind of ground, and a place in the middle of each."""
     world = np.arange(len(kinds))
-    maps = [terrain_map.build(np.zeros((65, 65)), np.full((8, 8), kind)) for kind in kinds]
+    maps = [TerrainMap.from_array(np.zeros((65, 65)), np.full((8, 8), kind)) for kind in kinds]
     terrain = terrain_map.stack(maps)
     places = Places(jnp.zeros((len(kinds), 3)), jnp.zeros(len(kinds)), jnp.asarray(world))
     return PatchData(places, terrain, places, terrain)

@@ -8,14 +8,13 @@ import pytest
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics.contact import LEAST_YIELD, GroundContact, contacts
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.state import Command, VehicleState
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.vector import Axes, Vector
 
 CONCRETE, MUD, SNOW = 1, 7, 9
-VEHICLE = hmmwv()
+VEHICLE = load_vehicle()
 RADIUS, WIDTH = float(VEHICLE.wheel_radius), float(VEHICLE.wheel_width)
 SUNK = 0.1
 
@@ -24,7 +23,7 @@ def halves(left: int, right: int, lengthwise: bool = False) -> TerrainMap:
     """Flat ground of two classes that meet at x = 0, or at y = 0 with `left` at y > 0."""
     classes = np.full((8, 8), left)
     classes[(slice(4, None), slice(None)) if lengthwise else (slice(None), slice(4, None))] = right
-    return terrain_map.build(np.zeros((65, 65)), classes, np.full((8, 8), 0.8))
+    return TerrainMap.from_array(np.zeros((65, 65)), classes, friction=np.full((8, 8), 0.8))
 
 
 def wheels(

@@ -14,10 +14,9 @@ from vertiwm_jax.mechanics.kinematic import (
     BicycleParams,
     ConstantVelocity,
     KinematicBicycle,
-    rest_on_ground,
+    place,
 )
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.map import TerrainMap
 
 PARAMS = BicycleParams(
@@ -31,7 +30,7 @@ PARAMS = BicycleParams(
 def plane(rise_x: float, rise_y: float) -> TerrainMap:
     x = np.arange(65) - 32.0
     heights = 50 + rise_x * x[None, :] - rise_y * x[:, None]
-    return terrain_map.build(heights, np.full((8, 8), 3))
+    return TerrainMap.from_array(heights, np.full((8, 8), 3))
 
 
 def matrix(state: VehicleState) -> np.ndarray:
@@ -91,10 +90,7 @@ def test_bicycle_approaches_the_commanded_speed_with_its_lag():
 
 def test_bicycle_climbs_at_its_speed_along_the_slope():
     ground = plane(0.5, 0.0)
-    position, rpy = rest_on_ground(
-        ground, jnp.zeros(2), jnp.float32(0), PARAMS.wheelbase, PARAMS.track, PARAMS.ride_height
-    )
-    state = VehicleState(position, rpy, jnp.array([2.0, 0, 0]), jnp.zeros(3))
+    state = place(ground, vehicle=PARAMS, speed=2.0)
     commands = Command(jnp.full(50, 2.0), jnp.zeros(50))
     driven = rollout(KinematicBicycle(), PARAMS, ground, state, commands)
     along = np.linalg.norm(np.asarray(driven.position[-1] - state.position))
@@ -104,14 +100,8 @@ def test_bicycle_climbs_at_its_speed_along_the_slope():
 @pytest.mark.parametrize("yaw", [0.0, 0.7, np.pi / 2, -2.5])
 @pytest.mark.parametrize("rise", [(0.3, 0.0), (0.0, 0.3), (-0.2, 0.25)])
 def test_rest_on_a_plane_is_exact(rise, yaw):
-    position, rpy = rest_on_ground(
-        plane(*rise),
-        jnp.array([1.3, -2.7]),
-        jnp.float32(yaw),
-        PARAMS.wheelbase,
-        PARAMS.track,
-        PARAMS.ride_height,
-    )
+    state = place(plane(*rise), (1.3, -2.7), yaw, vehicle=PARAMS)
+    position, rpy = state.position, state.rpy
     body = Rotation.from_euler("ZYX", np.asarray(rpy)[::-1]).as_matrix()
     normal = np.array([-rise[0], -rise[1], 1.0])
     normal /= np.linalg.norm(normal)
@@ -124,10 +114,7 @@ def test_rest_on_a_plane_is_exact(rise, yaw):
 
 def test_positive_pitch_is_nose_down_and_positive_roll_is_right_side_down():
     def at_rest(ground: TerrainMap) -> np.ndarray:
-        _, rpy = rest_on_ground(
-            ground, jnp.zeros(2), jnp.float32(0), PARAMS.wheelbase, PARAMS.track, jnp.float32(0.45)
-        )
-        return np.asarray(rpy)
+        return np.asarray(place(ground, vehicle=PARAMS).rpy)
 
     np.testing.assert_allclose(at_rest(plane(-0.3, 0.0)), [0, np.arctan(0.3), 0], atol=1e-5)
     np.testing.assert_allclose(at_rest(plane(0.0, 0.3)), [np.arctan(0.3), 0, 0], atol=1e-5)

@@ -10,22 +10,22 @@ from scipy.spatial.transform import Rotation
 
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics.bekker_wong import BekkerWongParams
-from vertiwm_jax.mechanics.kinematic import rest_on_ground
+from vertiwm_jax.mechanics.kinematic import bicycle_of, place
 from vertiwm_jax.mechanics.simulator import (
     Simulator,
     SimulatorHistory,
     SimulatorParams,
     chrono_like,
 )
-from vertiwm_jax.mechanics.vehicle import GRAVITY, hmmwv
+from vertiwm_jax.mechanics.vehicle import GRAVITY, load_vehicle
 from vertiwm_jax.state import Command, VehicleState
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.map import TerrainMap
 
 CONCRETE, MUD, SAND, SNOW = 1, 7, 8, 9
 STEPS = 50
-VEHICLE = hmmwv()
+VEHICLE = load_vehicle()
 PARAMS = chrono_like(VEHICLE)
+SIZES = replace(bicycle_of(VEHICLE), ride_height=jnp.float32(0.43))
 WEIGHT = float(VEHICLE.mass) * GRAVITY
 SIMULATOR = Simulator()
 
@@ -48,10 +48,10 @@ def ground(
     """64 m x 64 m of one class about `centre`."""
     c = np.arange(65) - 32.0
     x, y = np.meshgrid(c, -c)
-    return terrain_map.build(
+    return TerrainMap.from_array(
         height(x, y),
         np.full((8, 8), kind),
-        np.full((8, 8), friction),
+        friction=np.full((8, 8), friction),
         origin=(centre[0] - 32, centre[1] + 32),
     )
 
@@ -61,15 +61,7 @@ def waves(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def at_rest(terrain: TerrainMap, x: float = 0, y: float = 0, yaw: float = 0) -> VehicleState:
-    position, rpy = rest_on_ground(
-        terrain,
-        jnp.array([x, y], jnp.float32),
-        jnp.float32(yaw),
-        jnp.asarray(VEHICLE.wheelbase),
-        jnp.asarray(VEHICLE.track),
-        jnp.float32(0.43),
-    )
-    return VehicleState(position, rpy, jnp.zeros(3), jnp.zeros(3))
+    return place(terrain, (x, y), yaw, vehicle=SIZES)
 
 
 @jax.jit

@@ -12,18 +12,18 @@ from vertiwm_jax import config, froude
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics import vehicle
-from vertiwm_jax.mechanics.kinematic import bicycle_of, rest_on_ground
+from vertiwm_jax.mechanics.kinematic import bicycle_of, place
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
-from vertiwm_jax.state import Command, VehicleState
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.mechanics.vehicle import load_vehicle
+from vertiwm_jax.state import Command
+from vertiwm_jax.terrain.map import TerrainMap
 
 CONCRETE = 1
 ROVER = vehicle.load("rover")
 
 
 def test_files_hold_si_units_and_wheels_are_in_order():
-    found = hmmwv()
+    found = load_vehicle()
     assert found.mass == np.float32(2493.6) and found.wheelbase == np.float32(3.302)
     np.testing.assert_allclose(
         found.wheel_position, [[1.651, 0.91], [1.651, -0.91], [-1.651, 0.91], [-1.651, -0.91]]
@@ -34,7 +34,7 @@ def test_files_hold_si_units_and_wheels_are_in_order():
 
 
 def test_a_rover_at_full_size_is_about_an_hmmwv():
-    full, known = ROVER.vehicle, hmmwv()
+    full, known = ROVER.vehicle, load_vehicle()
     for name in ("mass", "wheel_radius", "wheelbase", "track", "wheel_torque", "wheel_power"):
         assert 0.5 < getattr(full, name) / getattr(known, name) < 2, name
     # The force of a relaxed spring that is lifted by its static deflection carries the weight.
@@ -81,14 +81,14 @@ def test_the_same_drive_at_four_times_the_size_takes_twice_as_long():
     x, y = np.meshgrid(*[(np.arange(65) - 32.0) / 4] * 2)
     heights = 2 + 0.06 * np.sin(2 * x) + 0.05 * np.sin(3 * y) + 0.1 * x
     semantic = np.full((8, 8), CONCRETE)
-    terrain = terrain_map.build(heights, semantic, np.full((8, 8), 0.7), resolution=0.25)
+    terrain = TerrainMap.from_array(
+        heights, semantic, friction=np.full((8, 8), 0.7), resolution=0.25
+    )
 
     def driven(scale, held, substeps):
         params = chrono_like(replace(ROVER, scale=scale).vehicle)
         ground, model = froude.scaled(terrain, scale), Simulator(substeps)
-        size = params.vehicle.wheelbase, params.vehicle.track, params.vehicle.wheel_radius
-        start = rest_on_ground(ground, jnp.zeros(2), jnp.float32(0.3), *size)
-        state = VehicleState(*start, jnp.zeros(3), jnp.zeros(3))
+        state = place(ground, yaw=0.3, vehicle=params.vehicle)
         steering = jnp.repeat(0.3 * jnp.sin(0.1 * jnp.arange(30)), held)
         command = Command(jnp.full(30 * held, 1.0 * scale**0.5), steering)
         return jax.jit(rollout, static_argnums=0)(model, params, ground, state, command)

@@ -8,7 +8,7 @@ from vertiwm_jax.mechanics import bekker_wong
 from vertiwm_jax.mechanics.bekker_wong import LOOSE_SAND, BekkerWongParams
 from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
 from vertiwm_jax.mechanics.wheel import Wheel
-from vertiwm_jax.terrain.soil import PRESETS, Soil, reece_moduli, stack
+from vertiwm_jax.terrain.soil import PRESETS, Soil, stack
 
 INCH, POUND, PSI = 0.0254, 4.4482216, 6894.757
 EXACT = {"creep_speed": 1e-4}  # the published equations know no rest
@@ -25,8 +25,8 @@ def settle(wheel, soil, contact, load, velocity_x, velocity_y, rim_speed):
 def reece_soil(width_inch, k1, k2, n, cohesion, phi):
     """Wong and Reece's sands, from psi and inches; K is 1.5 inches."""
     width = width_inch * INCH
-    # Their k1 is in psi and k2 in psi/inch.
-    kc, kphi = reece_moduli(k1 * PSI, k2 * PSI / INCH, n, width)
+    # Reece's pressure (k1 + k2 width)(z / width)^n as Bekker's; k1 is in psi and k2 in psi/inch.
+    kc, kphi = k1 * PSI * width ** (1 - n), k2 * PSI / INCH * width ** (1 - n)
     return Soil(kc, kphi, n, cohesion * PSI, np.deg2rad(phi), 1.5 * INCH, 0.0)
 
 

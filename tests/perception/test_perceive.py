@@ -15,6 +15,7 @@ from vertiwm_jax.perception.perceive import _plain, perceive, reduced
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import patches, sensing
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.sensing import SensingConfig
 
 CHANNELS = 5
@@ -48,7 +49,7 @@ def world(resolution=1.0, vertices_a_class=1.0, classes=10, seed=1) -> terrain_m
     rng = np.random.default_rng(seed)
     heights = rng.uniform(0, 3, (25, 33))
     kinds = rng.integers(0, classes, (int(24 / vertices_a_class), int(32 / vertices_a_class)))
-    return terrain_map.build(heights, kinds, resolution=resolution, origin=(-7.0, 11.0))
+    return TerrainMap.from_array(heights, kinds, resolution=resolution, origin=(-7.0, 11.0))
 
 
 def at(x, y, z, yaw) -> VehicleState:

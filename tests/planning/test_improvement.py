@@ -15,7 +15,7 @@ from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.planning.improvement import ImprovementConfig, PolicyImprovement
 from vertiwm_jax.rl.learned import ResidualPolicy
 
@@ -119,7 +119,7 @@ def test_nothing_is_expected_after_the_end(blocked, ending):
 @pytest.mark.integration
 def test_its_model_follows_the_vehicle():
     """A planner that imagines in what really happens knows what only the simulator remembers."""
-    simulator, params = Simulator(substeps=2), chrono_like(hmmwv())
+    simulator, params = Simulator(substeps=2), chrono_like(load_vehicle())
     env = NavigationEnv(simulator, CONFIG)
     tasks = task((-20.0, 0.0), (20.0, 0.0))
     env_params = env.make_params(params, ground(), tasks)

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from vertiwm_jax.simulators.chrono_ground import NO_SOIL, Ground, rectangles
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 CONCRETE, SAND = 1, 8
 
@@ -63,7 +63,9 @@ def world(cells):
     friction = np.full(semantic.shape, 0.5)
     friction[: cells // 2] = 0.7
     boxes = np.array([[110.0, 4.0, 2.0, 3.0, 1.0], [0, 0, 0, 0, 0]])
-    return height, terrain_map.build(height, semantic, friction, boxes, origin=(100.0, 64.0))
+    return height, TerrainMap.from_array(
+        height, semantic, friction=friction, obstacles=boxes, origin=(100.0, 64.0)
+    )
 
 
 def named(calls, name):

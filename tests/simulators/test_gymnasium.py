@@ -17,12 +17,13 @@ from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason as Reason
 from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.simulators.builtin import BuiltIn
 from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.simulators.gymnasium import SimulatorEnv
 from vertiwm_jax.simulators.protocol import Observation, SimulatorError
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 CONFIG = NavigationConfig(speed_range=(0.0, 5.0), horizon_seconds=6.0)
 TASKS = Tasks(
@@ -40,13 +41,13 @@ def terrain():
     semantic = np.full((16, 16), SNOW)
     semantic[:, 8:] = 0
     box = np.array([[15.0, -30.0, 4, 4, 3]])
-    return terrain_map.stack([ground(), terrain_map.build(hills(), semantic, obstacles=box)])
+    return terrain_map.stack([ground(), TerrainMap.from_array(hills(), semantic, obstacles=box)])
 
 
 @pytest.fixture(scope="module")
 def both(terrain):
     """Environments of a single task, inside jit and outside."""
-    env, vehicle = NavigationEnv(Simulator(), CONFIG), chrono_like(hmmwv())
+    env, vehicle = NavigationEnv(Simulator(), CONFIG), chrono_like(load_vehicle())
 
     def single(number):
         alone = jax.tree.map(lambda x: x[number : number + 1], TASKS)

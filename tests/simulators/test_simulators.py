@@ -11,16 +11,16 @@ from scipy.spatial.transform import Rotation
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import GRAVITY, hmmwv
+from vertiwm_jax.mechanics.vehicle import GRAVITY, load_vehicle
 from vertiwm_jax.simulators import chrono
 from vertiwm_jax.simulators.builtin import BuiltIn
 from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.simulators.protocol import SimulatorError
 from vertiwm_jax.state import Command
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 
 CONCRETE, SAND, SNOW = 1, 8, 9
-WEIGHT = float(hmmwv().mass) * GRAVITY
+WEIGHT = float(load_vehicle().mass) * GRAVITY
 
 
 def installed():
@@ -43,7 +43,7 @@ def ground(west=CONCRETE, east=CONCRETE, slope=0.0, origin=(100.0, 64.0)):
     semantic = np.full((16, 16), west)
     semantic[:, 8:] = east
     friction = np.full((16, 16), 0.8)
-    return terrain_map.build(elevation, semantic, friction, origin=origin)
+    return TerrainMap.from_array(elevation, semantic, friction=friction, origin=origin)
 
 
 def drive(simulator, start, commands):
@@ -109,7 +109,7 @@ def test_a_start_forgets_the_drive_before(kind):
 
 @pytest.mark.integration
 def test_the_built_in_simulator_is_the_one_inside_jit():
-    terrain, model, params = ground(slope=0.1, east=SAND), Simulator(), chrono_like(hmmwv())
+    terrain, model, params = ground(slope=0.1, east=SAND), Simulator(), chrono_like(load_vehicle())
     commands = np.random.default_rng(0).uniform([1, -0.3], [4, 0.3], (40, 2)).astype(np.float32)
     seen = drive(BuiltIn(terrain), (160.0, 5.0, 1.0), commands)
 
@@ -124,7 +124,7 @@ def test_the_built_in_simulator_is_the_one_inside_jit():
 
 
 def test_forces_of_the_built_in_simulator_are_what_moves_it():
-    mass, centre = float(hmmwv().mass), np.asarray(hmmwv().centre_of_mass)
+    mass, centre = float(load_vehicle().mass), np.asarray(load_vehicle().centre_of_mass)
     commands = np.tile([[4.0, 0.3], [4.0, -0.3]], (1, 20)).reshape(-1, 2)
     # Up a slope, with its belly on a ridge between the wheels.
     terrain = ground(slope=0.3)

@@ -4,6 +4,7 @@ import numpy as np
 
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import obstacles
+from vertiwm_jax.terrain.map import TerrainMap
 
 BOXES = np.array(
     [[3, 4, 4, 2, 3.8], [4, 4, 1, 6, 5], [-6, -3, 0.5, 0.5, 1], [0, 0, 0, 0, 0]], np.float32
@@ -11,7 +12,7 @@ BOXES = np.array(
 
 
 def build(boxes):
-    return terrain_map.build(np.zeros((33, 33)), np.zeros((4, 4), int), obstacles=boxes)
+    return TerrainMap.from_array(np.zeros((33, 33)), np.zeros((4, 4), int), obstacles=boxes)
 
 
 def corners(x, y, yaw, length, width):

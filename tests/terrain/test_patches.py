@@ -8,6 +8,7 @@ import pytest
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import patches
 from vertiwm_jax.terrain.classes import STANDARD
+from vertiwm_jax.terrain.map import TerrainMap
 
 CONCRETE, GRASS = STANDARD.names.index("concrete"), STANDARD.names.index("grass")
 
@@ -18,7 +19,7 @@ def terrain():
     rng = np.random.default_rng(0)
     return terrain_map.stack(
         [
-            terrain_map.build(
+            TerrainMap.from_array(
                 rng.uniform(0, 3, (33, 41)),
                 rng.integers(0, 10, (8, 10)),
                 resolution=0.5,
@@ -84,7 +85,7 @@ def test_patches_show_bump_and_colour_where_they_are(eighth):
     elevation = 4 * np.exp(-((x - bump[0]) ** 2 + (y - bump[1]) ** 2))
     cell = np.arange(128) * 0.25 - 15.875
     near = np.hypot(cell[None, :] - spot[0], -cell[:, None] - spot[1]) < 0.8
-    terrain = terrain_map.build(elevation, np.where(near, CONCRETE, GRASS), resolution=0.25)
+    terrain = TerrainMap.from_array(elevation, np.where(near, CONCRETE, GRASS), resolution=0.25)
 
     position = jnp.array([*vehicle, 0.0], jnp.float32)
     found = patches_of(terrain, 0, position, jnp.float32(yaw))
@@ -143,7 +144,7 @@ def test_bilinear_patches_relative_to_the_vehicle(resolution, vertices_a_class, 
     rng = np.random.default_rng(1)
     heights = rng.uniform(0, 3, (25, 33))
     kinds = rng.integers(0, 10, (int(24 / vertices_a_class), int(32 / vertices_a_class)))
-    terrain = terrain_map.build(heights, kinds, resolution=resolution, origin=(-7.0, 11.0))
+    terrain = TerrainMap.from_array(heights, kinds, resolution=resolution, origin=(-7.0, 11.0))
 
     x, y, z, yaw = pose
     found = patches_of(terrain, 0, jnp.array([x, y, z]), jnp.float32(yaw))
@@ -164,7 +165,7 @@ def test_bilinear_patches_relative_to_the_vehicle(resolution, vertices_a_class, 
 
 
 def test_patches_of_the_smallest_map():
-    terrain = terrain_map.build(np.array([[0.0, 1.0], [2.0, 3.0]]), np.array([[CONCRETE]]))
+    terrain = TerrainMap.from_array(np.array([[0.0, 1.0], [2.0, 3.0]]), np.array([[CONCRETE]]))
     found = patches_of(terrain, 0, jnp.zeros(3), jnp.float32(0))
     corners = found.elevation[jnp.array([0, 0, -1, -1]), jnp.array([0, -1, 0, -1])]
     np.testing.assert_allclose(4 * corners, [1, 3, 0, 2], atol=1e-6)  # ahead is to the right

@@ -6,6 +6,7 @@ import pytest
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.classes import STANDARD
+from vertiwm_jax.terrain.map import TerrainMap
 
 MUD, CONCRETE = STANDARD.names.index("mud"), STANDARD.names.index("concrete")
 
@@ -16,7 +17,7 @@ def terrain():
     rng = np.random.default_rng(0)
     return terrain_map.stack(
         [
-            terrain_map.build(
+            TerrainMap.from_array(
                 rng.uniform(0, 3, (33, 41)),
                 rng.integers(0, 10, (8, 10)),
                 resolution=0.5,
@@ -85,12 +86,12 @@ def test_soil_is_bilinear_and_rigid_ground_two_triangles():
     corner = np.array([[0.0, 1.0], [0.0, 0.0]])
     centre, lower = jnp.array([0.0, 0.0]), jnp.array([0.25, -0.25])
     for kind, middle, below in ((MUD, 0.25, 0.75 * 0.25), (CONCRETE, 0.5, 0.25)):
-        terrain = terrain_map.build(corner, np.array([[kind]]))
+        terrain = TerrainMap.from_array(corner, np.array([[kind]]))
         assert surface_of(terrain, 0, centre).height == pytest.approx(middle)
         assert surface_of(terrain, 0, lower).height == pytest.approx(below)
         assert query.height(terrain, centre) == pytest.approx(0.25)
     # The other diagonal is no ridge of rigid ground: a raised top left corner leaves it flat.
-    terrain = terrain_map.build(corner[:, ::-1], np.array([[CONCRETE]]))
+    terrain = TerrainMap.from_array(corner[:, ::-1], np.array([[CONCRETE]]))
     assert surface_of(terrain, 0, centre).height == pytest.approx(0.0)
 
 

@@ -10,6 +10,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import obstacles, patches, query, sensing
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.sensing import SensingConfig
 
 DISC = SensingConfig(range=12.0)
@@ -23,7 +24,7 @@ init = jax.jit(sensing.init, static_argnums=0)
 def world(elevation=None, origin=(-60.0, 62.0)):
     semantic = np.where(np.add.outer(np.arange(16), np.arange(16)) % 2, SNOW, GRASS)
     relief = hills() if elevation is None else elevation
-    return terrain_map.build(relief, semantic, obstacles=ROCKS, origin=origin)
+    return TerrainMap.from_array(relief, semantic, obstacles=ROCKS, origin=origin)
 
 
 def at(x, y, yaw):

@@ -6,7 +6,7 @@ import numpy as np
 from env.worlds import SNOW, hills
 
 from vertiwm_jax.learning.dataset import WheelSignals
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.viewing.scene import Prediction, Scene
 
 STEPS = 20
@@ -16,7 +16,7 @@ def scene() -> Scene:
     """2 s over hills in a bend, two predictions of 6 steps from 4 and 10 on, and a goal."""
     rng = np.random.default_rng(0)
     boxes = np.array([[18, 4, 2, 3, 1], [0, 0, 0, 0, 0]], np.float32)
-    terrain = terrain_map.build(hills(65), np.full((8, 8), SNOW), obstacles=boxes)
+    terrain = TerrainMap.from_array(hills(65), np.full((8, 8), SNOW), obstacles=boxes)
     time = 0.1 * np.arange(STEPS + 1)
     state = rng.normal(0, 0.1, (STEPS + 1, 12)).astype(np.float32)
     state[:, 0], state[:, 1], state[:, 2], state[:, 5] = 9 * time, time**2, 2.5, time

@@ -8,6 +8,7 @@ import numpy as np
 
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.network import NetworkSize
 from vertiwm_jax.world_model.normalization import Normalization
 
@@ -31,7 +32,7 @@ def rough(seed: int = 0, lift: float = 0.0, **changes) -> terrain_map.TerrainMap
     x = np.arange(49)
     hills = 4 + np.sin(x / 5)[:, None] + np.cos(x / 7) + rng.uniform(-0.1, 0.1, (49, 49))
     arrays = {"elevation": hills, "semantic": rng.integers(0, 10, (12, 12)), **changes}
-    return terrain_map.build(arrays["elevation"] + lift, arrays["semantic"])
+    return TerrainMap.from_array(arrays["elevation"] + lift, arrays["semantic"])
 
 
 def driving(seed: int = 0, *batch: int) -> VehicleState:

@@ -21,7 +21,7 @@ from vertiwm_jax.dynamics import along, rollout
 from vertiwm_jax.learning import augment, calibration
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.perception.features import init_pair, init_soil
 from vertiwm_jax.perception.perceive import perceive
 from vertiwm_jax.state import Command, VehicleState
@@ -33,7 +33,7 @@ from vertiwm_jax.world_model.network import BASE, WINDOW
 from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
 KEY, TERRAIN = jax.random.key(0), rough()
-PHYSICS = chrono_like(hmmwv())
+PHYSICS = chrono_like(load_vehicle())
 MODEL = Alone(Nesam(TINY))
 SCALE = 0.1 * CONSTANTS.transition_deviation
 

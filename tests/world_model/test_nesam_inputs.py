@@ -4,25 +4,24 @@ import jax.numpy as jnp
 import numpy as np
 from world_model.examples import CONSTANTS, commands, driving, one
 
-from vertiwm_jax.mechanics.kinematic import rest_on_ground
+from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.state import VehicleState
-from vertiwm_jax.terrain import map as terrain_map
+from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import nesam_inputs
 from vertiwm_jax.world_model.nesam_inputs import StepFeatures
 
 CONCRETE, SNOW = 1, 9
-VEHICLE = hmmwv()
+VEHICLE = load_vehicle()
 PHYSICS = chrono_like(VEHICLE)
-ON_ROAD = terrain_map.build(np.zeros((49, 49)), [[SNOW] * 12] * 6 + [[CONCRETE] * 12] * 6)
+ON_ROAD = TerrainMap.from_array(np.zeros((49, 49)), [[SNOW] * 12] * 6 + [[CONCRETE] * 12] * 6)
 """Snow to the north of y = 0, concrete to the south."""
 
 
 def features(yaw: float) -> StepFeatures:
     """Of a vehicle that stands on the border."""
-    place = jnp.zeros(2), jnp.float32(yaw), VEHICLE.wheelbase, VEHICLE.track, VEHICLE.wheel_radius
-    state = VehicleState(*rest_on_ground(ON_ROAD, *place), jnp.zeros(3), jnp.zeros(3))
+    state = place(ON_ROAD, yaw=yaw)
     memory = Simulator().init(PHYSICS, ON_ROAD, state)
     memory = replace(memory, sinkage=jnp.array([0.05, 0.0, 0.04, 0.0]), steering=jnp.float32(0.1))
     command, scale = one(commands(1), 0), jnp.ones(12)

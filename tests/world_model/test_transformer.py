@@ -18,7 +18,7 @@ from world_model.examples import (
 )
 
 from vertiwm_jax.dynamics import along, rollout, warm_up
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.perception.features import init_pair, init_reduce
 from vertiwm_jax.perception.perceive import perceive
 from vertiwm_jax.state import Command, VehicleState
@@ -37,7 +37,7 @@ def init_params(model, key=KEY):
     """Untrained parameters of one specialist."""
     encoders = replace(init_pair(key), reduce=init_reduce(key, TINY.channels))
     own = model.specialist.init_params(key, CONSTANTS)
-    return VertiWMParams((encoders,), hmmwv(), transformer=own)
+    return VertiWMParams((encoders,), load_vehicle(), transformer=own)
 
 
 def changed(params):

@@ -20,7 +20,7 @@ from world_model.examples import (
 from vertiwm_jax.dynamics import disagreement, rollout
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.config import ModelConfig
 from vertiwm_jax.perception.features import init_pair, init_reduce
 from vertiwm_jax.perception.perceive import perceive
@@ -61,9 +61,9 @@ def seeing(key, **more):
 
 UNTRAINED = VertiWMParams(
     encoders=(seeing(KEYS[0], reduce=init_reduce(KEYS[1], TINY.channels)), seeing(KEYS[3])),
-    vehicle=hmmwv(),
+    vehicle=load_vehicle(),
     transformer=moved(jax.jit(TRANSFORMER.init_params)(KEYS[0], CONSTANTS)),
-    nesam=bicycle_of(hmmwv()),
+    nesam=bicycle_of(load_vehicle()),
     gate=GateParams.untrained(KEYS[2], "mean", 1),
 )
 PARAMS = replace(UNTRAINED, gate=moved(UNTRAINED.gate))
@@ -224,7 +224,9 @@ def test_several_gates_fuse_by_the_mean_of_their_coefficients():
 
 def test_gates_are_added_to_those_there_are():
     config = ModelConfig(gates=3)
-    one = jax.eval_shape(lambda key: ModelConfig().init_params(key, chrono_like(hmmwv())), KEYS[0])
+    one = jax.eval_shape(
+        lambda key: ModelConfig().init_params(key, chrono_like(load_vehicle())), KEYS[0]
+    )
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one)
     more = config.with_gates(zeros, KEYS[1])
     assert len(more.gate) == 3

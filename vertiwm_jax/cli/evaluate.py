@@ -32,7 +32,7 @@ from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import HMMWV, hmmwv
+from vertiwm_jax.mechanics.vehicle import HMMWV, load_vehicle
 from vertiwm_jax.models.config import SoilSource
 from vertiwm_jax.models.registry import ModelName, load_fitted, load_model
 from vertiwm_jax.planning.improvement import ImprovementConfig
@@ -227,7 +227,7 @@ def _adapt(command: Adaptation) -> None:
     adapted = adaptation.adapt(command.filter, model, params, wrong, drives)
     found = adaptation.errors(model, params, terrain, wrong, adapted, drives, index)
     print(f"\n{adaptation.format_errors(found)}")
-    rows = adaptation.recovery(chrono_like(hmmwv()), terrain, wrong, adapted)
+    rows = adaptation.recovery(chrono_like(load_vehicle()), terrain, wrong, adapted)
     print(f"\n{adaptation.format_rows(rows)}" if rows else "\nno soil was driven on for long")
 
 

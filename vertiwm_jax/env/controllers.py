@@ -9,7 +9,7 @@ from vertiwm_jax.env.agent import Policy
 from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, GOAL, ROUTE_SCALE, arcs_ahead
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.traversability import TraversabilityCost
-from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
+from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
 
 REFERENCE = "straight to goal"
 """The controller whose failures define which tasks are hard."""
@@ -34,7 +34,7 @@ class StraightToGoal:
 
     config: NavigationConfig = struct.field(pytree_node=False)
     steering_limit: float = struct.field(
-        pytree_node=False, default_factory=lambda: float(hmmwv().steering_limit)
+        pytree_node=False, default_factory=lambda: float(load_vehicle().steering_limit)
     )
     speed: float = 4.0
     gain: float = 1.0

@@ -18,7 +18,7 @@ from vertiwm_jax.env.suites import GroundConfig
 from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState, see
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason, edge_distance, first_ending, is_terminal
-from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, hmmwv, load_vehicle
+from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, load_vehicle
 from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.state import STEP_SECONDS, VehicleState
@@ -59,7 +59,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
             ValueError: names the first task that cannot be driven, or whose settled state is not
                 finite.
         """
-        return self._pool.settled(dynamics, vehicle or hmmwv(), encoders, terrain, tasks)
+        return self._pool.settled(dynamics, vehicle or load_vehicle(), encoders, terrain, tasks)
 
     def shapes(
         self,
@@ -74,7 +74,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         Enough to restore what was learned with such parameters, or to compile what will be, without
         settling anything. Tasks that cannot be driven raise as there.
         """
-        return self._pool.shapes(dynamics, vehicle or hmmwv(), encoders, terrain, tasks)
+        return self._pool.shapes(dynamics, vehicle or load_vehicle(), encoders, terrain, tasks)
 
     def start(self, params: TaskParams, index: jax.Array) -> tuple[jax.Array, TaskState]:
         """Observation and state of start `[]` of the pool."""

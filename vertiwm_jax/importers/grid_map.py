@@ -10,7 +10,6 @@ from scipy import ndimage
 from vertiwm_jax.importers import rosbag
 from vertiwm_jax.importers.settings import Frames, GridMapSettings
 from vertiwm_jax.learning.schema import DataError
-from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.classes import STANDARD
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -92,7 +91,7 @@ def _build(
     x, y, z = frames.origin
     west, south = canvas.origin - [x, y]
     north = south + (known.shape[1] - 1) * canvas.resolution
-    built = terrain_map.build(
+    built = TerrainMap.from_array(
         _rows(heights - z),
         _rows(ground),
         resolution=canvas.resolution,

@@ -28,7 +28,7 @@ from vertiwm_jax.learning.soils import SoilProblem
 from vertiwm_jax.learning.stages import Inputs
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import VehicleConfig, hmmwv
+from vertiwm_jax.mechanics.vehicle import VehicleConfig, load_vehicle
 from vertiwm_jax.models.config import ModelConfig, with_soil
 from vertiwm_jax.runs import Run
 from vertiwm_jax.state import Command, VehicleState
@@ -145,7 +145,7 @@ def fit(
     model, parts = config.model, config.model.parts
     if start is None:
         constants = calibration.normalization(pipeline.load(KINDS, "train")[0])
-        physics = chrono_like(driven.vehicle if driven else hmmwv())
+        physics = chrono_like(driven.vehicle if driven else load_vehicle())
         params = model.init_params(key, physics, constants)
     else:
         params = model.with_gates(start, key)

@@ -8,7 +8,7 @@ from flax import struct
 from numpy.typing import ArrayLike
 
 from vertiwm_jax import geometry
-from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
+from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -87,28 +87,39 @@ class KinematicBicycle:
         level = jnp.cos(state.rpy[1]) * STEP_SECONDS * speed / jnp.cos(side_slip)
         xy = state.position[:2] + level * jnp.stack([jnp.cos(course), jnp.sin(course)])
         yaw = geometry.wrap(state.rpy[2] + STEP_SECONDS * yaw_rate)
-        position, rpy = rest_on_ground(
-            terrain, xy, yaw, params.wheelbase, params.track, params.ride_height
-        )
+        there = place(terrain, xy, yaw, vehicle=params)
         velocity = jnp.stack([speed, sideways, 0.0 * speed])
-        tilt_rate = geometry.wrap(rpy - state.rpy)[:2] / STEP_SECONDS
+        tilt_rate = geometry.wrap(there.rpy - state.rpy)[:2] / STEP_SECONDS
         angular_velocity = jnp.concatenate([tilt_rate, yaw_rate[None]])
-        return VehicleState(position, rpy, velocity, angular_velocity), ()
+        return replace(there, velocity=velocity, angular_velocity=angular_velocity), ()
 
 
-def rest_on_ground(
+def place(
     terrain: TerrainMap,
-    xy: jax.Array,
-    yaw: jax.Array,
-    wheelbase: jax.Array,
-    track: jax.Array,
-    ride_height: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Position `[3]` and roll, pitch, yaw `[3]` of a vehicle lying on the ground at xy `[2]`.
+    xy: ArrayLike | None = None,
+    yaw: ArrayLike = 0.0,
+    *,
+    vehicle: Vehicle | BicycleParams | None = None,
+    speed: ArrayLike = 0.0,
+) -> VehicleState:
+    """Places a vehicle on the plane through the ground under its four wheels.
 
-    It lies on the plane through the ground under its four wheels, its origin `ride_height`
-    above that plane.
+    Args:
+        terrain: the map, with the world selected.
+        xy: `[2]` m in the frame of the world; the middle of the map by default.
+        yaw: heading, rad from x (east) to y (north).
+        vehicle: the HMMWV by default. Its origin lies `ride_height` above the plane.
+        speed: m/s, forward.
+
+    Returns:
+        Its state, leaves `[3]`. A model lets it settle by a few centimeters in its first steps.
     """
+    sizes = load_vehicle() if vehicle is None else vehicle
+    wheelbase, track = jnp.float32(sizes.wheelbase), jnp.float32(sizes.track)
+    if xy is None:
+        low, high = terrain.extent
+        xy = (low + high) / 2
+    xy, yaw = jnp.asarray(xy, jnp.float32), jnp.asarray(yaw, jnp.float32)
     forward = 0.5 * wheelbase * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
     left = 0.5 * track * jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)])
     wheels = xy + jnp.stack([forward + left, forward - left, -forward + left, -forward - left])
@@ -117,41 +128,8 @@ def rest_on_ground(
     bank = 0.5 * (fl + rl - fr - rr) / track
     pitch = -jnp.arctan(rise)
     roll = jnp.arctan(bank * jnp.cos(pitch))
-    height = 0.25 * (fl + fr + rl + rr) + ride_height * jnp.sqrt(1 + rise**2 + bank**2)
-    return jnp.append(xy, height), jnp.stack([roll, pitch, yaw])
-
-
-def place(
-    terrain: TerrainMap,
-    xy: ArrayLike | None = None,
-    yaw: ArrayLike = 0.0,
-    *,
-    vehicle: Vehicle | None = None,
-    speed: ArrayLike = 0.0,
-) -> VehicleState:
-    """Places a vehicle on the ground under its four wheels.
-
-    Args:
-        terrain: the map, with the world selected.
-        xy: `[2]` m in the frame of the world; the middle of the map by default.
-        yaw: heading, rad from x (east) to y (north).
-        vehicle: the HMMWV by default.
-        speed: m/s, forward.
-
-    Returns:
-        Its state, leaves `[3]`. A model lets it settle by a few centimetres in its first steps.
-    """
-    sizes = hmmwv() if vehicle is None else vehicle
-    if xy is None:
-        low, high = terrain.extent
-        xy = (low + high) / 2
-    position, rpy = rest_on_ground(
-        terrain,
-        jnp.asarray(xy, jnp.float32),
-        jnp.asarray(yaw, jnp.float32),
-        jnp.float32(sizes.wheelbase),
-        jnp.float32(sizes.track),
-        jnp.float32(sizes.ride_height),
-    )
+    above = jnp.float32(sizes.ride_height) * jnp.sqrt(1 + rise**2 + bank**2)
+    height = 0.25 * (fl + fr + rl + rr) + above
     velocity = jnp.zeros(3).at[0].set(speed)
-    return VehicleState(position, rpy, velocity, jnp.zeros(3))
+    rpy = jnp.stack([roll, pitch, yaw])
+    return VehicleState(jnp.append(xy, height), rpy, velocity, jnp.zeros(3))

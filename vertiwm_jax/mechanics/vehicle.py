@@ -1,7 +1,6 @@
 """A four-wheeled vehicle: masses, suspension, drivetrain, speed controller and limits."""
 
 from dataclasses import fields
-from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -25,12 +24,12 @@ class Vehicle:
     """A vehicle with independent suspension and all-wheel drive; SI units, body axes.
 
     Wheels are front-left, front-right, rear-left, rear-right. The body origin lies between the
-    wheel centres of the design position. To the simulator, what is `[]` of a wheel may be `[4]`.
+    wheel centers of the design position. To the simulator, what is `[]` of a wheel may be `[4]`.
 
     mass: `[]` kg, wheels included.
     centre_of_mass: `[3]` m.
-    inertia: `[3]` kg m2, principal moments about the centre of mass.
-    wheel_position: `[4, 2]` x, y of the wheel centres, m.
+    inertia: `[3]` kg m2, principal moments about the center of mass.
+    wheel_position: `[4, 2]` x, y of the wheel centers, m.
     wheel_radius, wheel_width: `[]` m.
     wheel_inertia: `[]` kg m2 about the axle.
     wheel_weight: `[]` N, pulls an airborne wheel down.
@@ -44,7 +43,7 @@ class Vehicle:
     brake_torque: `[]` N m a wheel at full braking.
     tyre_friction: `[]` the tyre's own friction coefficient; contact takes the smaller one.
     hull: `[P, 3]` m, points of the chassis that touch the ground first, underside and roof.
-    length, width: `[]` m, the rectangle that collides with obstacles, centred on the origin.
+    length, width: `[]` m, the rectangle that collides with obstacles, centerd on the origin.
     """
 
     mass: jax.Array
@@ -87,7 +86,7 @@ class Vehicle:
 
     @property
     def travel_at_rest(self) -> jax.Array:
-        """`[4]` m, height of the wheel centres in the body where the springs carry the weight."""
+        """`[4]` m, height of the wheel centers in the body where the springs carry the weight."""
         load = self.mass * GRAVITY / 4
         return self.free_travel + (load - self.wheel_weight) / self.spring
 
@@ -122,9 +121,9 @@ class VehicleConfig:
     mass: Positive
     """kg, wheels included."""
     centre_of_mass: tuple[float, float, float]
-    """m in the body, whose origin lies between the wheel centres of the design position."""
+    """m in the body, whose origin lies between the wheel centers of the design position."""
     inertia: tuple[Positive, Positive, Positive]
-    """kg m2, principal moments about the centre of mass."""
+    """kg m2, principal moments about the center of mass."""
     wheelbase: Positive
     """m between the axles."""
     track: Positive
@@ -214,7 +213,8 @@ def load_vehicle(name: str = HMMWV) -> Vehicle:
     """Loads a vehicle.
 
     Args:
-        name: of one that comes along (`hmmwv`, `rover`, ...), or a YAML file of one.
+        name: of one that comes along (`hmmwv`, `rover`, ...), or a YAML file of one. The HMMWV of
+            Chrono, which the shipped model is fitted to, by default.
 
     Returns:
         Its numbers at full size, in SI units, in the body frame: x forward, y left, z up.
@@ -223,12 +223,6 @@ def load_vehicle(name: str = HMMWV) -> Vehicle:
         ConfigError: there is no such vehicle, or its file is malformed.
     """
     return load(name).vehicle
-
-
-@cache
-def hmmwv() -> Vehicle:
-    """Chrono's HMMWV, the vehicle of the shipped model."""
-    return load(HMMWV).vehicle
 
 
 def _box(x: float, y: float, belly: float, roof: float) -> list[tuple[float, float, float]]:

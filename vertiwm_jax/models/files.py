@@ -7,7 +7,7 @@ import jax
 from vertiwm_jax import checkpoints
 from vertiwm_jax import config as configuration
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.config import ModelConfig
 from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
@@ -33,7 +33,7 @@ def load(folder: Path) -> tuple[ModelConfig, VertiWMParams]:
     if path is None:
         raise checkpoints.CheckpointError(f"{folder}: expected the weights of a model, found none")
     like = jax.eval_shape(
-        lambda key: config.init_params(key, chrono_like(hmmwv())), jax.random.key(0)
+        lambda key: config.init_params(key, chrono_like(load_vehicle())), jax.random.key(0)
     )
     leaves = jax.tree.leaves_with_path(like)
     names = [jax.tree_util.keystr(at, simple=True, separator=".") for at, _ in leaves]

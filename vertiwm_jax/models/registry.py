@@ -8,7 +8,7 @@ from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
+from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
 from vertiwm_jax.models import files
 from vertiwm_jax.models.config import SoilSource, with_soil
 from vertiwm_jax.perception.features import Encoders
@@ -51,9 +51,9 @@ def load_model(
         CheckpointError, ConfigError: as `files.load`, and when the folder holds other parts alone.
     """
     if name == "builtin":
-        return Simulator(), chrono_like(vehicle or hmmwv())
+        return Simulator(), chrono_like(vehicle or load_vehicle())
     if name == "bicycle":
-        return KinematicBicycle(), bicycle_of(vehicle or hmmwv())
+        return KinematicBicycle(), bicycle_of(vehicle or load_vehicle())
     folder = Path(weights or files.PRETRAINED)
     found = load_fitted(folder, soil, embeddings, exact_gradient)
     if name not in found:

@@ -15,7 +15,7 @@ from vertiwm_jax.mechanics.simulator import (
     SimulatorParams,
     chrono_like,
 )
-from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
+from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
 from vertiwm_jax.simulators.protocol import SETTLE_SECONDS, Observation, under_wheels
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
@@ -39,7 +39,7 @@ class BuiltIn:
     """
 
     def __init__(self, terrain: TerrainMap, vehicle: Vehicle | None = None) -> None:
-        self._terrain, self._params = terrain, chrono_like(vehicle or hmmwv())
+        self._terrain, self._params = terrain, chrono_like(vehicle or load_vehicle())
 
     def start(self, x: float, y: float, yaw: float) -> Observation:
         """As `Simulator.start`."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from vertiwm_jax import geometry
 from vertiwm_jax.learning.dataset import WheelSignals
-from vertiwm_jax.mechanics.vehicle import hmmwv
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.simulators.chrono_ground import Ground
 from vertiwm_jax.simulators.protocol import (
     SETTLE_SECONDS,
@@ -41,7 +41,7 @@ SOIL_WINDOW = (1.0, 0.6, 1.0)
 SOIL_NEAR = 0.8
 """m from a wheel within which soil counts, on mixed ground."""
 
-_HMMWV = hmmwv()
+_HMMWV = load_vehicle()
 
 
 def modules() -> tuple[Any, Any]:

@@ -6,6 +6,8 @@ the ground continues level from its edge; a NaN coordinate reads the first row o
 a map is observed in part, unknown ground is as `ObservedMap` assumes.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -51,36 +53,44 @@ def _cell(
     return i, j
 
 
-def known(
-    terrain: TerrainMap, observed: ObservedMap, row: jax.Array, column: jax.Array
-) -> jax.Array:
-    """Whether a vehicle knows the map at fractional vertex coordinates on it."""
-    cell_rows, cell_columns = observed.known.shape
+def known(terrain: TerrainMap, known: jax.Array, row: jax.Array, column: jax.Array) -> jax.Array:
+    """Elements of `ObservedMap.known` at fractional vertex coordinates on the map."""
+    cell_rows, cell_columns = known.shape
     i, j = _cell(terrain, cell_rows, cell_columns, row, column)
-    return gather(observed.known, i * cell_columns + j)
+    return gather(known, i * cell_columns + j)
+
+
+def as_observed(
+    terrain: TerrainMap,
+    row: jax.Array,
+    column: jax.Array,
+    values: jax.Array,
+    assumed: Callable[[ObservedMap], jax.Array],
+) -> jax.Array:
+    """Values of the map at fractional vertex coordinates; where it is unknown, what is assumed."""
+    observed = terrain.observed
+    if observed is None:
+        return values
+    return jnp.where(known(terrain, observed.known, row, column), values, assumed(observed))
 
 
 def classes(terrain: TerrainMap, row: jax.Array, column: jax.Array, cell: jax.Array) -> jax.Array:
     """int32 class ids at fractional vertex coordinates on the map, which lie in the cells."""
     semantic = gather(terrain.semantic, cell).astype(jnp.int32)
-    observed = terrain.observed
-    if observed is None:
-        return semantic
-    return jnp.where(known(terrain, observed, row, column), semantic, observed.semantic)
+    return as_observed(terrain, row, column, semantic, lambda observed: observed.semantic)
 
 
 def _vertices(
     terrain: TerrainMap, row: jax.Array, column: jax.Array, index: jax.Array
 ) -> jax.Array:
     """Heights of the vertices in the rows and columns, at the index, m."""
-    heights = gather(terrain.elevation, index)
-    observed = terrain.observed
-    if observed is None:
-        return heights
-    x = terrain.origin[0] + column * terrain.resolution
-    y = terrain.origin[1] - row * terrain.resolution
-    guess = observed.plane[0] + observed.plane[1] * x + observed.plane[2] * y
-    return jnp.where(known(terrain, observed, row, column), heights, guess)
+
+    def assumed(observed: ObservedMap) -> jax.Array:
+        x = terrain.origin[0] + column * terrain.resolution
+        y = terrain.origin[1] - row * terrain.resolution
+        return observed.plane[0] + observed.plane[1] * x + observed.plane[2] * y
+
+    return as_observed(terrain, row, column, gather(terrain.elevation, index), assumed)
 
 
 def bilinear(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Array:

@@ -11,10 +11,9 @@ import numpy as np
 from PIL import Image
 
 from vertiwm_jax import atomic, froude
-from vertiwm_jax.errors import one_line
 from vertiwm_jax.terrain import query, soil, vertibench
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
-from vertiwm_jax.terrain.map import MapError, TerrainMap, build, stack
+from vertiwm_jax.terrain.map import MapError, TerrainMap, refusing, stack
 from vertiwm_jax.terrain.soil import Soil
 
 # How Chrono calls our soil parameters, and how many of its units make one of ours.
@@ -27,8 +26,6 @@ _SOIL_FIELDS = {
     "Janosi_shear": ("shear_modulus", 1.0),
     "unit_weight": ("unit_weight", 1.0),
 }
-
-
 _NO_DATA = 42113  # GDAL's tag of the value that stands for none
 
 
@@ -69,37 +66,24 @@ def save(terrain: TerrainMap, path: str | Path) -> None:
 
     Raises `WriteError` where that is not possible.
     """
-    world = int(terrain.world)
-    elevation, semantic, friction, obstacles = (
-        np.asarray(x[world])
-        for x in (terrain.elevation, terrain.semantic, terrain.friction, terrain.obstacles)
-    )
-    deformable = np.asarray(terrain.deformable)
-    rows, columns = (
-        np.minimum(np.arange(n) * cells // (n - 1), cells - 1)
-        for n, cells in zip(elevation.shape, semantic.shape, strict=True)
-    )
+    world, deformable = int(terrain.world), np.asarray(terrain.deformable)
+    semantic, obstacles = np.asarray(terrain.semantic[world]), np.asarray(terrain.obstacles[world])
     of_class = query.soils(terrain)
     soils = {
         name: [float(getattr(of_class, f)[k]) * unit for f, unit in _SOIL_FIELDS.values()]
         for k, name in enumerate(terrain.class_names)
         if deformable[k]
     }
-    meta = {
-        "classes": terrain.class_names,
-        "soil_fields": list(_SOIL_FIELDS),
-        "soils": soils,
-    }
+    meta = {"classes": terrain.class_names, "soil_fields": list(_SOIL_FIELDS), "soils": soils}
     stream = io.BytesIO()
     np.savez_compressed(
         stream,
-        elevation=elevation,
-        semantic=semantic[np.ix_(rows, columns)],
-        resolution=np.asarray(terrain.resolution),
-        origin=np.asarray(terrain.origin),
-        class_rgb=np.asarray(terrain.class_rgb),
+        elevation=terrain.elevation[world],
+        resolution=terrain.resolution,
+        origin=terrain.origin,
+        class_rgb=terrain.class_rgb,
         patch_class=semantic,
-        patch_friction=np.where(deformable[semantic], np.nan, friction).astype(np.float32),
+        patch_friction=np.where(deformable[semantic], np.float32(np.nan), terrain.friction[world]),
         obstacles=obstacles[(obstacles != 0).any(axis=1)],
         meta=np.array(json.dumps(meta)),
     )
@@ -112,7 +96,7 @@ def from_heightmap(
     height_range: tuple[float, float] | None = None,
     class_image: str | Path | None = None,
     default_class: str = "grass",
-    classes: GroundClasses = STANDARD,
+    ground: GroundClasses = STANDARD,
     origin: tuple[float, float] | None = None,
 ) -> TerrainMap:
     """Makes a map from heights in a 16-bit PNG, `.npy` or GeoTIFF file; row 0 is north.
@@ -121,86 +105,48 @@ def from_heightmap(
         path: the file.
         resolution: m between pixels.
         height_range: heights in m of the darkest and the brightest integer that a pixel can hold;
-            without it, values are metres.
-        class_image: an 8-bit image of ids, or an RGB image of the palette's colours, over the same
+            without it, values are meters.
+        class_image: an 8-bit image of ids, or an RGB image of the palette's colors, over the same
             extent at any resolution.
         default_class: all ground, where there is no such image.
-        classes: what ids and colours stand for.
-        origin: x, y of the first pixel, m; the map is centred by default.
+        ground: the classes of ground that ids and colors refer to.
+        origin: x, y of the first pixel, m; the map is centered by default.
 
     Raises:
         MapError: a file is missing or malformed; the message names it and the field.
     """
-    name = str(path)
-    if not resolution > 0:
-        raise MapError(name, "resolution", "metres between pixels, > 0", f"{resolution}")
-    heights = _read_raster(Path(path), "elevation")
-    if heights.ndim != 2:
-        raise MapError(name, "elevation", "one height a pixel", f"shape {heights.shape}")
+    name, heights = str(path), _read_raster(Path(path), "elevation")
     if height_range is not None:
         if not np.issubdtype(heights.dtype, np.unsignedinteger):
             raise MapError(
                 name, "height_range", "unsigned integers to scale", f"dtype {heights.dtype}",
-                "leave height_range out: the values are taken as metres",
+                "leave height_range out: the values are taken as meters",
             )  # fmt: skip
         low, high = height_range
         heights = low + heights * ((high - low) / np.iinfo(heights.dtype).max)
-    if class_image is not None:
-        semantic = _read_classes(Path(class_image), classes)
-    elif default_class in classes.names:
-        semantic = np.full((1, 1), classes.names.index(default_class), np.uint8)
-        semantic = np.broadcast_to(semantic, heights.shape)
-    else:
-        raise MapError(name, "default_class", f"one of {', '.join(classes.names)}", default_class)
-    return build(
-        heights,
-        semantic,
-        resolution=resolution,
-        origin=origin,
-        classes=classes,
-        name=name if class_image is None else f"{name} with {class_image}",
+    classes = default_class if class_image is None else _read_classes(Path(class_image), ground)
+    name = name if class_image is None else f"{name} with {class_image}"
+    return TerrainMap.from_array(
+        heights, classes, resolution=resolution, origin=origin, ground=ground, name=name
     )
 
 
 def _load_world(path: Path) -> TerrainMap:
     name = str(path)
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {field: file[field] for field in file.files}
-    except Exception as error:  # Of zip files, of what they compress and of NumPy's headers.
-        raise MapError(name, "file", "an .npz map", one_line(error)) from None
-    wanted = ("elevation", "patch_class", "patch_friction", "obstacles", "class_rgb", "meta")
-    for field in (*wanted, "resolution", "origin"):
-        if field not in arrays:
-            raise MapError(name, field, "an array of this name", f"only {', '.join(arrays)}")
-    for field, shape in (("resolution", ()), ("origin", (2,))):
-        if arrays[field].shape != shape:
-            raise MapError(name, field, f"shape {shape}", f"{arrays[field].shape}")
-    try:
-        return build(
-            arrays["elevation"],
-            arrays["patch_class"],
-            arrays["patch_friction"],
-            arrays["obstacles"],
-            resolution=float(arrays["resolution"]),
-            origin=tuple(arrays["origin"].tolist()),
-            classes=_classes(json.loads(str(arrays["meta"])), arrays["class_rgb"], name),
+    with refusing(name, "file", "an .npz map"), np.load(path, allow_pickle=False) as file:
+        return TerrainMap.from_array(
+            file["elevation"],
+            file["patch_class"],
+            resolution=float(file["resolution"]),
+            origin=file["origin"],
+            friction=file["patch_friction"],
+            obstacles=file["obstacles"],
+            ground=_classes(json.loads(str(file["meta"])), file["class_rgb"], name),
             name=name,
         )
-    except MapError:
-        raise
-    except json.JSONDecodeError as error:
-        raise MapError(name, "meta", "JSON text", str(error)) from None
-    except (TypeError, ValueError, AttributeError) as error:
-        raise MapError(
-            name, "file", "a map's fields", f"one ill-typed: {one_line(error)}"
-        ) from None
 
 
 def _classes(meta: dict, rgb: np.ndarray, name: str) -> GroundClasses:
-    for field in ("classes", "soils", "soil_fields"):
-        if field not in meta:
-            raise MapError(name, f"meta.{field}", "an entry of this name", f"{', '.join(meta)}")
     names = tuple(meta["classes"])
     if unknown := set(meta["soils"]) - set(names):
         raise MapError(name, "meta.soils", f"soils among {', '.join(names)}", f"{sorted(unknown)}")
@@ -233,40 +179,40 @@ def _soil(key: str, values: dict[str, float], name: str) -> Soil:
 
 def _read_raster(path: Path, field: str) -> np.ndarray:
     """The pixels of an image, GeoTIFF or `.npy` file."""
-    suffix = path.suffix.lower()
-    try:
+    with refusing(str(path), field, "a PNG, .npy or GeoTIFF file"):
+        suffix = path.suffix.lower()
         if suffix == ".npy":
             return np.load(path, allow_pickle=False)
         if suffix in (".tif", ".tiff"):
-            try:
-                import tifffile
-            except ImportError:
-                raise MapError(
-                    str(path), field, "the package tifffile to read GeoTIFF", "it is not installed",
-                    "pip install 'vertiwm-jax[geotiff]'",
-                ) from None  # fmt: skip
-            with tifffile.TiffFile(path) as tiff:
-                page = tiff.pages.first
-                pixels, nothing = page.asarray(), page.tags.get(_NO_DATA) and page.nodata
-            if nothing is not None and (holes := np.sum(pixels == nothing)):
-                expected, found = "a value in every pixel", f"{holes} that are {nothing:g}, no data"
-                raise MapError(str(path), field, expected, found, "fill the holes")
-            return pixels
+            return _read_geotiff(path, field)
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB") if image.mode in ("P", "RGBA") else image)
-    except MapError:
-        raise
-    except Exception as error:  # Of as many kinds as there are formats.
-        raise MapError(str(path), field, "a PNG, .npy or GeoTIFF file", one_line(error)) from None
+
+
+def _read_geotiff(path: Path, field: str) -> np.ndarray:
+    try:
+        import tifffile
+    except ImportError:
+        raise MapError(
+            str(path), field, "the package tifffile to read GeoTIFF", "it is not installed",
+            "pip install 'vertiwm-jax[geotiff]'",
+        ) from None  # fmt: skip
+    with tifffile.TiffFile(path) as tiff:
+        page = tiff.pages.first
+        pixels = page.asarray()
+        if page.tags.get(_NO_DATA) and (holes := np.sum(pixels == page.nodata)):
+            found = f"{holes} that are {page.nodata:g}, no data"
+            raise MapError(str(path), field, "a value in every pixel", found, "fill the holes")
+    return pixels
 
 
 def _read_classes(path: Path, classes: GroundClasses) -> np.ndarray:
-    """`[r, c]` class ids from an image of ids or of palette colours."""
+    """`[r, c]` class ids from an image of ids or of palette colors."""
     pixels = _read_raster(path, "class_image")
     if pixels.ndim == 2:
         return pixels
     if pixels.ndim != 3 or pixels.shape[2] != 3:
-        raise MapError(str(path), "class_image", "ids or RGB colours", f"shape {pixels.shape}")
+        raise MapError(str(path), "class_image", "ids or RGB colors", f"shape {pixels.shape}")
     matches = (pixels[:, :, None] == classes.rgb).all(-1)
     unknown = np.argwhere(~matches.any(-1))
     if len(unknown):
@@ -276,7 +222,7 @@ def _read_classes(path: Path, classes: GroundClasses) -> np.ndarray:
         )
         found = f"{tuple(pixels[row, column].tolist())} at row {row}, column {column}"
         raise MapError(
-            str(path), "class_image", f"colours of the palette ({palette})",
+            str(path), "class_image", f"colors of the palette ({palette})",
             f"{found} ({len(unknown)} such)", "save it without smoothing or compression loss",
         )  # fmt: skip
     return matches.argmax(-1).astype(np.uint8)

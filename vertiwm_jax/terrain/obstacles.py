@@ -6,28 +6,20 @@ import jax.numpy as jnp
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 
+Side = float | jax.Array
+
 
 def collides(
-    terrain: TerrainMap,
-    xy: jax.Array,
-    yaw: jax.Array,
-    length: float | jax.Array,
-    width: float | jax.Array,
+    terrain: TerrainMap, xy: jax.Array, yaw: jax.Array, length: Side, width: Side
 ) -> jax.Array:
-    """Whether rectangles centred at `[..., 2]` with `[...]` yaw touch an obstacle: `[...]` bool.
+    """Whether rectangles centered at `[..., 2]` with `[...]` yaw touch an obstacle: `[...]` bool.
 
     length: m along x of the body; width: m along y. A NaN pose touches nothing.
     """
     return gap(terrain, xy, yaw, length, width) <= 0
 
 
-def gap(
-    terrain: TerrainMap,
-    xy: jax.Array,
-    yaw: jax.Array,
-    length: float | jax.Array,
-    width: float | jax.Array,
-) -> jax.Array:
+def gap(terrain: TerrainMap, xy: jax.Array, yaw: jax.Array, length: Side, width: Side) -> jax.Array:
     """`[...]` m between the rectangles of `collides` and the nearest obstacle; inf without any.
 
     This is the largest gap on the two axes of the map and the two of the body (separating-axis

@@ -28,7 +28,7 @@ class Patches:
     """Vehicle-aligned observations of the ground, m_t of the paper, in [-1, 1].
 
     elevation: `[..., 128, 128]`; row 0 is farthest ahead, column 0 farthest left.
-    rgb: `[..., 128, 128, 3]` semantic colours, same pixels.
+    rgb: `[..., 128, 128, 3]` semantic colors, same pixels.
     """
 
     elevation: jax.Array
@@ -92,20 +92,18 @@ def pixels(
     return elevation, jnp.stack([_raster.gather(c, semantic) for c in palette.T], axis=1)
 
 
-def footprint_covered(
-    wheel_reach: float, top_speed: float, step_seconds: float = STEP_SECONDS
-) -> None:
+def footprint_covered(wheel_reach: float, top_speed: float) -> None:
     """Raises unless a patch covers the wheels of the next pose (Sec. III-A), at any heading.
 
     wheel_reach: m from the body origin to the farthest ground a wheel can touch.
     top_speed: m/s, the largest in any direction.
     """
-    needed, covered = wheel_reach + top_speed * step_seconds, PATCH_METRES / 2
+    needed, covered = wheel_reach + top_speed * STEP_SECONDS, PATCH_METRES / 2
     if not needed <= covered:
-        fastest = (covered - wheel_reach) / step_seconds
+        fastest = (covered - wheel_reach) / STEP_SECONDS
         raise ConfigError(
             f"patch: expected {PATCH_METRES} m to cover the wheels of the next pose, found a reach "
-            f"of {wheel_reach:g} m + {top_speed:g} m/s x {step_seconds:g} s = {needed:g} m "
+            f"of {wheel_reach:g} m + {top_speed:g} m/s x {STEP_SECONDS} s = {needed:g} m "
             f"> {covered:g} m; keep the top speed below {fastest:g} m/s"
         )
 

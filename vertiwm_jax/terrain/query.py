@@ -52,9 +52,7 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
     friction = _raster.gather(terrain.friction, cell)
     if terrain.grip is not None:
         friction = terrain.grip * friction
-    if terrain.observed is not None:
-        known = _raster.known(terrain, terrain.observed, row, column)
-        friction = jnp.where(known, friction, terrain.observed.friction)
+    friction = _raster.as_observed(terrain, row, column, friction, lambda seen: seen.friction)
     return Surface(height, gradient, semantic, friction)
 
 
@@ -79,7 +77,7 @@ def known(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     if terrain.observed is None:
         return jnp.ones(xy.shape[:-1], bool)
     column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
-    return _raster.known(terrain, terrain.observed, row, column)
+    return _raster.known(terrain, terrain.observed.known, row, column)
 
 
 def _grid_coordinates(

@@ -24,7 +24,7 @@ class SensingConfig:
     range: Positive = math.inf
     """Distance, m, at which ground, and obstacles by their middle, are seen."""
     field_of_view: Annotated[float, Bounds(0, 2 * math.pi, above=True)] = 2 * math.pi
-    """Angle of view, rad, centred ahead. Ground nearer than 4 m is always seen."""
+    """Angle of view, rad, centered ahead. Ground nearer than 4 m is always seen."""
     cells: Count = 64
     """Cells along each side of the map; each cell is known or not."""
 
@@ -36,11 +36,9 @@ class SensingConfig:
 
 def check(config: SensingConfig, terrain: TerrainMap) -> None:
     """`ValueError` if cells are so large that a vehicle may not see the cell that it stands in."""
-    rows, columns = terrain.elevation.shape[-2:]
-    width, height = (float(terrain.resolution) * (n - 1) for n in (columns, rows))
-    near = min(config.range, NEAR)
-    if config.partial and math.hypot(width, height) / config.cells > 2 * near:
-        least = math.ceil(math.hypot(width, height) / (2 * near))
+    width, height = terrain.size.tolist()
+    least = math.ceil(math.hypot(width, height) / (2 * min(config.range, NEAR)))
+    if config.partial and config.cells < least:
         raise ConfigError(
             f"sensing.cells: expected at least {least} on a map of {width:g} x {height:g} m with a "
             f"range of {config.range:g} m, found {config.cells}"

@@ -35,7 +35,7 @@ class Soil:
 def _soil(
     kc: float, kphi: float, n: float, cohesion: float, phi: float, k: float, weight: float
 ) -> Soil:
-    """A preset from kN, kPa and degrees. Leaves are NumPy's, since importing must not start JAX."""
+    """A preset from kN, kPa and degrees, of NumPy numbers, since importing must not start JAX."""
     si = (1e3 * kc, 1e3 * kphi, n, 1e3 * cohesion, math.radians(phi), k, 1e3 * weight)
     return Soil(*(cast(jax.Array, np.asarray(value, np.float32)) for value in si))
 
@@ -76,18 +76,6 @@ def stack(soils: Sequence[Soil]) -> Soil:
     return jax.tree.map(
         lambda *leaves: jnp.stack([jnp.asarray(x, jnp.float32) for x in leaves]), *soils
     )
-
-
-def reece_moduli(
-    k1: jax.Array | float, k2: jax.Array | float, n: jax.Array | float, width: jax.Array | float
-) -> tuple[jax.Array | float, jax.Array | float]:
-    """Bekker's kc and kphi for Reece's pressure (k1 + k2 width)(z / width)^n, all `[...]`.
-
-    k1: Pa. k2: Pa/m. width: m, the smaller side of the contact; the moduli hold for it alone.
-    Source: Reece (1965); Wong and Reece, J. Terramechanics 4(1) (1967).
-    """
-    scale = width ** (1 - n)
-    return k1 * scale, k2 * scale
 
 
 # Wong, Theory of Ground Vehicles, 4th ed. (2008), table 2.3, from snow and wet loam to sand and
@@ -145,17 +133,11 @@ _RANGES: dict[str, tuple[float, float, str]] = {
 }
 
 
-def validate(soil: Soil, name: str = "soil") -> Soil:
-    """The same soil, any shape `[...]`; `ValueError` names the first parameter out of range.
-
-    For concrete values at the border (files, configuration), not inside jit.
-    """
+def out_of_range(soil: Soil) -> str:
+    """Names the first parameter of a concrete soil `[...]` that is out of range; "" if none is."""
     for field, (low, high, unit) in _RANGES.items():
         values = np.asarray(getattr(soil, field))
         bad = ~((values >= low) & (values <= high))
         if bad.any():
-            raise ValueError(
-                f"{name}.{field}: expected {low:g} to {high:g} ({unit}), "
-                f"found {values[bad].flat[0]:g}"
-            )
-    return soil
+            return f"{field} of {values[bad].flat[0]:g}, outside {low:g} to {high:g} ({unit})"
+    return ""

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import yaml
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from vertiwm_jax.terrain.classes import STANDARD
-from vertiwm_jax.terrain.map import MapError, TerrainMap, build, stack
+from vertiwm_jax.terrain.map import MapError, TerrainMap, refusing, stack
 from vertiwm_jax.terrain.worlds import CELLS, HALF_EXTENT, ROCK_SIZE, TREE_SIZE, VERTICES
 
 _FOLDER = Path("envs/data/BenchMaps/sampled_maps")
@@ -51,62 +51,39 @@ def _world(image: Path, path: Path) -> TerrainMap:
     name = str(path)
     # The C loader is ten times as fast, where PyYAML was built with it.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    try:
+    with refusing(name, "file", "Verti-Bench's YAML"):
         config = yaml.load(path.read_text(), Loader=loader)
-        max_height = float(config["terrain"]["max_height"])
-        semantic, friction = _patches(config["textures"], name)
-        obstacles = _obstacles(config["obstacles"])
-    except yaml.YAMLError as error:
-        raise MapError(name, "file", "YAML", " ".join(str(error).split())) from None
-    except KeyError as error:
-        raise MapError(name, "file", "Verti-Bench's fields", f"no {error}") from None
-    except MapError:
-        raise
-    except (TypeError, ValueError) as error:
-        raise MapError(name, "file", "Verti-Bench's fields", f"one ill-typed: {error}") from None
-    return build(
-        _gray(image) * (max_height / 255),
-        semantic,
-        friction,
-        obstacles,
-        resolution=1.0,
-        # The look-ups of Verti-Bench use half a size of 64.5 m: half a metre off its own ground.
-        origin=(-HALF_EXTENT, HALF_EXTENT),
-        name=name,
-    )
+        classes, friction = _patches(config["textures"])
+        return TerrainMap.from_array(
+            _gray(image) * (float(config["terrain"]["max_height"]) / 255),
+            classes,
+            resolution=1.0,
+            # The look-ups of Verti-Bench use half a size of 64.5 m: half a meter off its ground.
+            origin=(-HALF_EXTENT, HALF_EXTENT),
+            friction=friction,
+            obstacles=_obstacles(config["obstacles"]),
+            name=name,
+        )
 
 
 def _gray(path: Path) -> np.ndarray:
-    try:
-        with Image.open(path) as image:
-            gray = np.asarray(image.convert("L"), np.float32)
-    except (OSError, UnidentifiedImageError) as error:
-        raise MapError(str(path), "elevation", "an 8-bit gray BMP", str(error)) from None
+    with refusing(str(path), "elevation", "an 8-bit gray BMP"), Image.open(path) as image:
+        gray = np.asarray(image.convert("L"), np.float32)
     if gray.shape != (VERTICES, VERTICES):
         raise MapError(str(path), "elevation", f"{VERTICES} x {VERTICES} pixels", f"{gray.shape}")
     return gray
 
 
-def _patches(textures: list[dict[str, Any]], name: str) -> tuple[np.ndarray, np.ndarray]:
-    """`[16, 16]` class ids and friction; index [i, j] counts i from +y and j from -x."""
-    semantic = np.full((CELLS, CELLS), -1)
-    friction = np.zeros((CELLS, CELLS), np.float32)
+def _patches(textures: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
+    """`[16, 16]` class ids, -1 where there is none, and friction; row 0 is north, column 0 west."""
+    ids = {name: k for k, name in enumerate(STANDARD.names)}
+    classes, friction = np.full((CELLS, CELLS), -1), np.zeros((CELLS, CELLS))
     for texture in textures:
-        i, j = texture["index"]
-        kind = texture["terrain_type"]
-        if kind not in STANDARD.names:
-            expected = f"one of {', '.join(STANDARD.names)}"
-            raise MapError(name, f"textures [{i}, {j}].terrain_type", expected, f"{kind}")
-        if not (0 <= i < CELLS and 0 <= j < CELLS):
-            raise MapError(name, "textures.index", f"0 to {CELLS - 1}", f"[{i}, {j}]")
-        semantic[i, j] = STANDARD.names.index(kind)
+        index, kind = tuple(texture["index"]), texture["terrain_type"]
+        classes[index] = ids[kind]
         if kind not in STANDARD.soils:
-            friction[i, j] = texture["friction"]
-    missing = np.argwhere(semantic < 0)
-    if len(missing):
-        found = f"{len(missing)} missing, the first at index {missing[0].tolist()}"
-        raise MapError(name, "textures", f"all {CELLS} x {CELLS} patches", found)
-    return semantic, friction
+            friction[index] = texture["friction"]
+    return classes, friction
 
 
 def _obstacles(config: dict[str, list[dict[str, Any]]]) -> np.ndarray:

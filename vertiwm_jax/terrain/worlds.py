@@ -5,10 +5,9 @@ difficulty with the median slope of its low, mid and high worlds, and one beyond
 """
 
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import cycle, islice, product
-from typing import Annotated, Literal, get_args
+from typing import Annotated, ClassVar, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +25,7 @@ HALF_EXTENT = 64.0
 HIGHEST = 16.0
 """Height of the ground at most, m, which is that of Verti-Bench's worlds."""
 START_RADIUS = 60.0
-"""Starts and goals lie on a circle of this radius about the centre, m."""
+"""Starts and goals lie on a circle of this radius about the center, m."""
 START_CLEARANCE = 6.0
 """No obstacle comes nearer to that circle than this, m."""
 ROCK_SIZE = (4.4, 4.4, 3.8)
@@ -44,29 +43,6 @@ _FFT_PERIOD = 256  # the smallest power of two that holds the map without wrappi
 _VORONOI_CELLS = 10
 
 
-@dataclass(frozen=True)
-class ReliefConfig:
-    """Shape of the ground before it is scaled to its median slope. Pairs are bounds of a draw.
-
-    exponent: fall of the amplitude spectrum of the roughness with spatial frequency; larger is
-        smoother.
-    shortest, longest: bounds of the wavelengths of the roughness, m.
-    patchiness: standard deviation of the logarithm of the roughness between places. It makes
-        steep spots steeper at the same median slope.
-    hills: largest height of hills of 25 to 130 m, in multiples of the roughness' scale.
-    ridges: largest number of ridges and ditches.
-    clearing: probability of a nearly level clearing.
-    """
-
-    exponent: tuple[float, float] = (0.6, 1.4)
-    shortest: tuple[float, float] = (2.2, 3.5)
-    longest: tuple[float, float] = (20.0, 60.0)
-    patchiness: float = 0.4
-    hills: float = 5.0
-    ridges: int = 4
-    clearing: float = 0.4
-
-
 @settings
 class WorldConfig:
     """Settings of procedural worlds, which cycle through all pairs of difficulty and kind.
@@ -82,17 +58,18 @@ class WorldConfig:
     rocks: CountOrZero = 0
     trees: CountOrZero = 0
     obstructed: Share = 1.0
-    relief: ReliefConfig = ReliefConfig()
+
+    GONE: ClassVar[dict[str, str]] = {
+        "relief": "the shape of procedural ground is no longer set; leave this key out"
+    }
 
     def check(self) -> None:
         for difficulty in self.difficulties:
-            if isinstance(difficulty, str) and difficulty not in MEDIAN_SLOPE_DEG:
+            preset = difficulty in MEDIAN_SLOPE_DEG
+            if not preset and (isinstance(difficulty, str) or not 0 <= difficulty < 60):
                 names = ", ".join(MEDIAN_SLOPE_DEG)
-                expected = f"one of {names} or a median slope in degrees"
+                expected = f"one of {names} or a median slope of 0 to 60 deg"
                 raise ValueError(f"difficulties: expected {expected}, found {difficulty!r}")
-            if not isinstance(difficulty, str) and not 0 <= difficulty < 60:
-                expected = "a median slope of 0 to 60 deg"
-                raise ValueError(f"difficulties: expected {expected}, found {difficulty}")
         for kind in self.kinds:
             if kind not in _KINDS:
                 raise ValueError(f"kinds: expected one of {', '.join(_KINDS)}, found {kind!r}")
@@ -111,13 +88,13 @@ def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> Terrai
         worlds are as large as ever there, and so small to the vehicle itself.
     """
     drawn = labels(config, len(keys))
-    slope = [d if isinstance(d, float | int) else MEDIAN_SLOPE_DEG[d] for d, _ in drawn]
+    slope = [MEDIAN_SLOPE_DEG[d] if isinstance(d, str) else d for d, _ in drawn]
     kind = [_KINDS.index(k) for _, k in drawn]
     # One after the other: `vmap` would be no faster, compile twice as long, and take W times the
     # memory for the transforms; and so every number of worlds runs the same program.
     parts = [
         (
-            *_ground(keys[i], np.float32(slope[i]), np.int32(kind[i]), config.relief),
+            *_ground(keys[i], np.float32(slope[i]), np.int32(kind[i])),
             _obstacles(keys[i], config.rocks, config.trees, config.obstructed),
         )
         for i in range(len(keys))
@@ -126,18 +103,14 @@ def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> Terrai
     # By NumPy: to stack so many arrays would be a program for every number of worlds.
     stacked = map(np.stack, zip(*jax.device_get(parts), strict=True))
     elevation, semantic, friction, obstacles = map(jnp.asarray, stacked)
-    return TerrainMap(
+    level = TerrainMap.from_array(np.zeros((VERTICES, VERTICES)), np.zeros((CELLS, CELLS), int))
+    return replace(
+        level,
         elevation=elevation,
         semantic=semantic,
         friction=friction,
         obstacles=obstacles,
-        origin=jnp.array([-HALF_EXTENT, HALF_EXTENT], jnp.float32),
-        resolution=jnp.float32(RESOLUTION),
-        class_rgb=jnp.asarray(STANDARD.rgb),
-        deformable=jnp.asarray(STANDARD.deformable),
         soils=jax.tree.map(lambda leaf: leaf[None], soils),
-        world=jnp.int32(0),
-        class_names=STANDARD.names,
     )
 
 
@@ -158,17 +131,17 @@ def make_worlds(
     return generate(jax.random.split(jax.random.key(seed), number), config, scale)
 
 
-@functools.partial(xla.brief_jit, static_argnames="relief")
+@xla.brief_jit
 def _ground(
-    key: jax.Array, slope_deg: jax.Array, kind: jax.Array, relief: ReliefConfig
+    key: jax.Array, slope_deg: jax.Array, kind: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Elevation, semantic classes and friction of one world."""
     relief_key, class_key, friction_key, _ = jax.random.split(key, 4)
     semantic = _classes(class_key, kind)
-    return _relief(relief_key, slope_deg, relief), semantic, _friction(friction_key, semantic)
+    return _relief(relief_key, slope_deg), semantic, _friction(friction_key, semantic)
 
 
-def _relief(key: jax.Array, slope_deg: jax.Array, config: ReliefConfig) -> jax.Array:
+def _relief(key: jax.Array, slope_deg: jax.Array) -> jax.Array:
     """`[129, 129]` heights from 0 up, m, whose triangles have the median slope, give or take."""
     noise_key, ridge_key, scalar_key = jax.random.split(key, 3)
     # One draw for all scalars: every call of the generator costs compile time.
@@ -177,20 +150,22 @@ def _relief(key: jax.Array, slope_deg: jax.Array, config: ReliefConfig) -> jax.A
     def between(low: float, high: float) -> jax.Array:
         return low + (high - low) * next(uniform)
 
-    exponents = (between(*config.exponent), 1.0, 2.0)
-    shortest = (between(*config.shortest), 12.0, 25.0)
-    longest = (between(*config.longest), 60.0, 130.0)
-    rough, patches, hills = _noises(noise_key, exponents, shortest, longest)
-    rough = rough / _median_slope(rough) * jnp.exp(config.patchiness * patches)
+    # Of the roughness, of its differences between places, and of hills.
+    exponent = jnp.stack([between(0.6, 1.4), jnp.float32(1), jnp.float32(2)])
+    shortest = jnp.stack([between(2.2, 3.5), jnp.float32(12), jnp.float32(25)])
+    longest = jnp.stack([between(20.0, 60.0), jnp.float32(60), jnp.float32(130)])
+    rough, patches, hills = _noises(noise_key, exponent, shortest, longest)
+    rough = rough / _median_slope(rough) * jnp.exp(0.4 * patches)
     # Squared, so that most worlds are rough and some are rolling.
-    hills = config.hills * between(0, 1) ** 2 * hills
+    hills = 5.0 * between(0, 1) ** 2 * hills
     axis = jnp.arange(VERTICES) * RESOLUTION - HALF_EXTENT
     x, y = axis[None, :], -axis[:, None]
-    ridges = _ridges(ridge_key, x, y, config.ridges)
+    ridges = _ridges(ridge_key, x, y)
 
+    # A nearly level clearing in some worlds.
     squared = (x - between(-40, 40)) ** 2 + (y - between(-40, 40)) ** 2
     inside = jnp.exp(-((squared / between(10, 25) ** 2) ** 2))
-    level = jnp.where(between(0, 1) < config.clearing, 0.85, 0.0) * inside
+    level = jnp.where(between(0, 1) < 0.4, 0.85, 0.0) * inside
     heights = (rough + ridges) * (1 - level) + hills
 
     slope = jnp.tan(jnp.deg2rad(slope_deg)) * between(1 - _SLOPE_SPREAD, 1 + _SLOPE_SPREAD)
@@ -201,19 +176,16 @@ def _relief(key: jax.Array, slope_deg: jax.Array, config: ReliefConfig) -> jax.A
 
 
 def _noises(
-    key: jax.Array,
-    exponents: Sequence[jax.Array | float],
-    shortest: Sequence[jax.Array | float],
-    longest: Sequence[jax.Array | float],
+    key: jax.Array, exponent: jax.Array, shortest: jax.Array, longest: jax.Array
 ) -> jax.Array:
-    """`[n, 129, 129]` fields of power-law noise between two wavelengths in m, of unit deviation."""
+    """`[n, 129, 129]` fields of power-law noise between two wavelengths in m, of unit deviation.
+
+    exponent: `[n]` fall of the amplitude spectrum with spatial frequency; larger is smoother.
+    """
     axis = np.fft.fftfreq(_FFT_PERIOD, RESOLUTION)
     frequency = np.hypot(axis[:, None], axis[None, :])
     frequency[0, 0] = 1e-3  # outside every band; keeps the power finite
-    exponent, low, high = (
-        jnp.stack([jnp.asarray(x, jnp.float32) for x in values])[:, None, None]
-        for values in (exponents, shortest, longest)
-    )
+    exponent, low, high = (x[:, None, None] for x in (exponent, shortest, longest))
     band = (frequency > 1 / high) & (frequency < 1 / low)
     amplitude = jnp.where(band, frequency**-exponent, 0.0)
     phase = jax.random.uniform(key, amplitude.shape, maxval=2 * np.pi)
@@ -232,11 +204,11 @@ def _median_slope(heights: jax.Array) -> jax.Array:
     return jnp.mean(jax.lax.bitcast_convert_type(middle, jnp.float32)) / RESOLUTION
 
 
-def _ridges(key: jax.Array, x: jax.Array, y: jax.Array, most: int) -> jax.Array:
-    """The sum of 0 to `most` straight ridges (up) and ditches (down) over points x, y."""
+def _ridges(key: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+    """The sum of 0 to 4 straight ridges (up) and ditches (down) over points x, y."""
     low = jnp.array([0, -50, -40, 1.2, 15, -4])
     high = jnp.array([2 * np.pi, 50, 40, 5, 60, 4])
-    drawn = jax.random.uniform(key, (most, 6), minval=low, maxval=high)
+    drawn = jax.random.uniform(key, (4, 6), minval=low, maxval=high)
     angle, offset, middle, width, length, rise = jnp.moveaxis(drawn, 1, 0)[..., None, None]
     across = (x * jnp.cos(angle) + y * jnp.sin(angle) - offset) / width
     along = (y * jnp.cos(angle) - x * jnp.sin(angle) - middle) / length
@@ -254,14 +226,14 @@ def _classes(key: jax.Array, kind: jax.Array) -> jax.Array:
     rigid_order = jnp.argsort(order[:FIRST_DEFORMABLE])
     soil_order = FIRST_DEFORMABLE + jnp.argsort(order[FIRST_DEFORMABLE:])
     drawn = jax.random.uniform(other_key, (2 + 2 * _VORONOI_CELLS + 4 * soils,))
-    counts, centres, size, corner = jnp.split(
+    counts, centers, size, corner = jnp.split(
         drawn, [2, 2 + 2 * _VORONOI_CELLS, 2 + 2 * _VORONOI_CELLS + 2 * soils]
     )
     rigid_count, soil_count = 1 + (counts * jnp.array([FIRST_DEFORMABLE, soils])).astype(jnp.int32)
 
-    centres = CELLS * centres.reshape(_VORONOI_CELLS, 2)
+    centers = CELLS * centers.reshape(_VORONOI_CELLS, 2)
     i, j = jnp.mgrid[:CELLS, :CELLS]
-    squared = (i[..., None] + 0.5 - centres[:, 0]) ** 2 + (j[..., None] + 0.5 - centres[:, 1]) ** 2
+    squared = (i[..., None] + 0.5 - centers[:, 0]) ** 2 + (j[..., None] + 0.5 - centers[:, 1]) ** 2
     cell = jnp.argmin(squared, axis=-1)
     rigid, soil = rigid_order[cell % rigid_count], soil_order[cell % soil_count]
 

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from vertiwm_jax.learning.dataset import WheelSignals
-from vertiwm_jax.mechanics.vehicle import Vehicle, hmmwv
+from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.fusion import COEFFICIENTS
@@ -67,7 +67,7 @@ class Scene:
     goal: np.ndarray | None = None
     goal_radius: float = 0.0
     prediction: Prediction | None = None
-    vehicle: Vehicle = field(default_factory=lambda: jax.device_get(hmmwv()))
+    vehicle: Vehicle = field(default_factory=lambda: jax.device_get(load_vehicle()))
 
     @property
     def steps(self) -> int:
