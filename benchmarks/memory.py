@@ -42,9 +42,11 @@ def main() -> None:
     env = NavigationEnv(dynamics, config.navigation, config.variation)
     algorithm = Seeds(config.algorithm(env), config.loop.seeds)
     encoders = experiment.encoders(config)
-    training.compiled(algorithm, env.shapes(weights, terrain, pool, encoders))
+    shapes = env.make_params(weights, terrain, pool, encoders=encoders, settled=False)
+    training.compiled(algorithm, shapes)
     results["compiled"] = {"most_MB": most()}
-    params = jax.block_until_ready(env.make_params(weights, terrain, pool, encoders))
+    made = env.make_params(weights, terrain, pool, encoders=encoders)
+    params = jax.block_until_ready(made)
     results["worlds and starts"] = {
         "most_MB": most(),
         "terrain_MB": size(params.terrain),

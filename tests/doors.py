@@ -72,8 +72,8 @@ def untrained(kind: type[TrainConfig], run: Path) -> list[DeterministicPolicy]:
         return jnp.asarray(rng.uniform(0.1, 1, leaf.shape), leaf.dtype)
 
     state = jax.tree.map(drawn, shapes)
-    learned = algorithm.policy(training.params, state), algorithm.value(training.params, state)
-    policy.save(run / policy.FOLDER, config.of_policy, *learned)
+    value = algorithm.value(training.params, state)
+    policy.save(run / policy.FOLDER, config.of_policy, value)
     return [
         algorithm.policy(training.params, jax.tree.map(lambda x, i=i: x[i], state))
         for i in range(config.loop.seeds)

@@ -40,7 +40,7 @@ def save(folder: str | Path, step: int, state: Any, keep: int) -> Path:
         if hosts.is_first():
             _clean(folder)
         with _quiet():
-            leaves = jax.device_get(hosts.without_keys(_flatten(state)))
+            leaves = jax.device_get(hosts.without_keys(named_leaves(state)))
             writing = ocp.save_async(str(path), leaves)
             try:
                 writing.result()
@@ -74,7 +74,7 @@ def load(path: str | Path, like: State) -> State:
     A checkpoint with other leaves, shapes or types raises `CheckpointError` that names the first.
     """
     path = Path(path).absolute()
-    leaves = _flatten(like)
+    leaves = named_leaves(like)
     shapes = jax.eval_shape(hosts.without_keys, leaves)
     stored = {name: shapes[name] for name in leaves}  # in their order
     try:
@@ -106,9 +106,9 @@ def _alone() -> ocp.Context:
     return ocp.Context(multiprocessing_options=options)
 
 
-def _flatten(state: Any) -> dict[str, Any]:
-    """Leaves by name, so that a checkpoint depends on no class of ours."""
-    leaves = jax.tree.leaves_with_path(state)
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """Leaves by dotted name, so that a file depends on no class of ours."""
+    leaves = jax.tree.leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 

@@ -6,7 +6,7 @@ what is shared out already, everything is computed in one place.
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -155,7 +155,14 @@ def shard(function: Callable[..., T], in_specs: Sequence[Any], out_specs: Any) -
 def vmap(
     function: Callable[..., Any], in_axes: Sequence[int | None], chunk: int | None = None
 ) -> Callable[..., Any]:
-    """`jax.vmap` of a function, the batch shared out to the devices.
+    """`jax.vmap` of a function, the batch shared out to the devices; arguments as in `batched`."""
+    return batched(jax.vmap(function, in_axes), in_axes, chunk)
+
+
+def batched(
+    function: Callable[..., Any], in_axes: Sequence[int | None], chunk: int | None = None
+) -> Callable[..., Any]:
+    """A function of batches, leaves `[B, ...]`, the batch shared out to the devices.
 
     in_axes: 0 for arguments with the axis of the batch, None for others. All arrays must be
         arguments: what a function closes over is not on the device.
@@ -173,14 +180,16 @@ def vmap(
 
         def of_device(*args: Any) -> Any:
             if turns == 1:
-                return jax.vmap(function, in_axes)(*args)
+                return function(*args)
             mapped = [arg for arg, axis in zip(args, in_axes, strict=True) if axis == 0]
 
-            def of_one(row: list[Any]) -> Any:
-                own, all_ = iter(row), zip(args, in_axes, strict=True)
+            def turn(mapped: list[Any]) -> Any:
+                own, all_ = iter(mapped), zip(args, in_axes, strict=True)
                 return function(*(next(own) if axis == 0 else arg for arg, axis in all_))
 
-            return jax.lax.map(of_one, mapped, batch_size=together)
+            split = jax.tree.map(lambda x: x.reshape(turns, together, *x.shape[1:]), mapped)
+            found = jax.lax.map(turn, split)
+            return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
 
         of_all = shard(of_device, [ROWS if axis == 0 else WHOLE for axis in in_axes], ROWS)
         if len(rows) == size:
@@ -205,48 +214,6 @@ def shared_out(function: Callable[..., T], batch: int) -> Callable[..., T]:
         return gather(over, result)
 
     return on_mesh
-
-
-def shapes(function: Callable[..., T], batch: int) -> Callable[..., T]:
-    """What `shared_out` of a function gives, of which only shapes are known; it is traced here."""
-
-    def on_mesh(*args: Any) -> T:
-        over = mesh(batch)
-        with jax.set_mesh(over):
-            return jax.eval_shape(function, *place(over, args))
-
-    return on_mesh
-
-
-def in_turns(function: Callable[[Any], T], batch: Any, at_a_time: int) -> T:
-    """What a function gives for all rows of leaves `[B, ...]`, of so many of which it is asked.
-
-    All results are in memory once, and those of one turn again.
-    """
-    size = len(jax.tree.leaves(batch)[0])
-    found = None
-    for first in range(0, size, at_a_time):
-        first = min(first, size - at_a_time)  # The last turn has some rows of the one before.
-        rows = slice(first, first + at_a_time)
-        given = function(jax.tree.map(lambda x, rows=rows: x[rows], batch))
-        if found is None:
-            found = _room(given, size)
-        found = _with_rows(found, given, first)
-    return cast(T, found)
-
-
-@partial(jax.jit, static_argnames="size")
-def _room(tree: T, size: int) -> T:
-    """Zeros `[size, ...]` for leaves `[..., ...]`."""
-    return jax.tree.map(lambda x: jnp.zeros((size, *x.shape[1:]), x.dtype), tree)
-
-
-@partial(jax.jit, donate_argnums=0)
-def _with_rows(tree: T, some: T, first: jax.Array) -> T:
-    """The tree with some of its rows, `first` and those that follow it, replaced."""
-    return jax.tree.map(
-        lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, first, axis=0), tree, some
-    )
 
 
 def share(tree: T) -> T:

@@ -1,30 +1,30 @@
 import gymnax
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from env.worlds import ground, hills
 
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.gym import GYMNAX_NAME
-from vertiwm_jax.terrain.worlds import WorldConfig
+from vertiwm_jax.terrain import map as terrain_map
 
 STEPS = 6
 
 
 @pytest.fixture(scope="module")
 def made():
-    """Episodes of 3 steps on two level worlds."""
-    settings = {"relief": WorldConfig(("low",)), "number": 2, "starts": 5, "seed": 3}
-    return gymnax.make(GYMNAX_NAME, config=NavigationConfig(horizon_seconds=0.3), **settings)
+    """Episodes of 3 steps on two worlds."""
+    terrain = terrain_map.stack([ground(hills()), ground(hills(height=0.5))])
+    config = NavigationConfig(horizon_seconds=0.3)
+    return gymnax.make(GYMNAX_NAME, terrain=terrain, model="bicycle", pairs=5, config=config)
 
 
 def test_it_is_made_by_name():
     assert GYMNAX_NAME in gymnax.registered_envs
 
 
-@pytest.mark.integration
 def test_random_rollouts_in_gymnax_s_own_way(made):
     env, env_params = made
 
@@ -54,16 +54,12 @@ def test_random_rollouts_in_gymnax_s_own_way(made):
     assert len(np.unique(info["distance"][:, 2])) > 1
 
 
-@pytest.mark.integration
 def test_settings_decide_worlds_and_tasks(made):
     env, env_params = made
-    assert env_params.terrain.worlds == 2 and env_params.pool_size == 5
-    again = env.default_params
-    np.testing.assert_array_equal(again.starts.goal, env_params.starts.goal)
-    np.testing.assert_array_equal(again.terrain.elevation, env_params.terrain.elevation)
-    other, params = gymnax.make(GYMNAX_NAME, number=1, starts=2, relief=WorldConfig(("low",)))
-    assert other != env and params.terrain.worlds == 1
-    assert not jnp.array_equal(params.terrain.elevation[0], env_params.terrain.elevation[0])
+    assert env_params.terrain.worlds == 2 and env_params.pool_size == 10
+    assert env.default_params is env_params
+    other, params = gymnax.make(GYMNAX_NAME, terrain=ground(), model="bicycle", pairs=1)
+    assert other != env and params.terrain.worlds == params.pool_size == 1
 
 
 def test_a_model_that_does_not_exist_is_refused():

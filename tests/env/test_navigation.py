@@ -200,7 +200,7 @@ def test_shapes_are_those_of_what_is_made():
     terrain = ground(hills())
     pool = circle_tasks(terrain, 55.0, 3)
     env, made = bicycle_env(terrain, pool)
-    shapes = env.shapes(BICYCLE, terrain, pool)
+    shapes = env.make_params(BICYCLE, terrain, pool, settled=False)
     chex.assert_trees_all_equal_shapes_and_dtypes(shapes, made)
     assert isinstance(shapes.start_observation, jax.ShapeDtypeStruct)
 
@@ -236,7 +236,7 @@ def test_a_model_is_traced_once_for_starts_and_for_steps(name, monkeypatch):
     terrain = ground(hills())
     pool = circle_tasks(terrain, 55.0, 4)
     env, number = NavigationEnv(model), len(pool.world)
-    shapes = env.shapes(params, terrain, pool)
+    shapes = env.make_params(params, terrain, pool, settled=False)
     mesh = parallel.mesh(number)
     keys, actions = jax.random.split(KEY, number), jnp.zeros((number, 2))
     given = jax.tree.map(

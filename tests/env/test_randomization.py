@@ -99,5 +99,5 @@ def test_a_vehicle_climbs_less_on_varied_ground():
 
 @pytest.mark.parametrize("wrong", [{"grip": (0.9, 0.5)}, {"soil": (0.0, 1.0)}, {"delay": (-1, 2)}])
 def test_ranges_without_sense_are_refused(wrong):
-    with pytest.raises(ValueError, match=f"{next(iter(wrong))}: expected least and most"):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))}: expected"):
         RandomizationConfig(**wrong)

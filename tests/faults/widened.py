@@ -59,9 +59,7 @@ CASES = {
     "bicycle": lambda: drive(KinematicBicycle(), bicycle_of(load_vehicle())),
     "simulator": lambda: drive(Simulator(), chrono_like(load_vehicle())),
     "shipped weights": lambda: drive(*load_model("vertiwm")),
-    "gymnax": lambda: gymnax.make(vertiwm_jax.gym.GYMNAX_NAME, model="builtin", number=1, starts=4)[
-        1
-    ],
+    "gymnax": lambda: gymnax.make(vertiwm_jax.gym.GYMNAX_NAME, terrain=ground(), pairs=1)[1],
     "ppo": lambda: learn(lambda env: PPO(env, PPOConfig(**COLLECTED, minibatches=2, epochs=1))),
     "sac": lambda: learn(lambda env: SAC(env, SACConfig(**REPLAYED))),
     "td3": lambda: learn(lambda env: TD3(env, TD3Config(**REPLAYED))),

@@ -296,8 +296,9 @@ def _navigate(command: Navigation) -> None:
         policies = {REFERENCE: policies[REFERENCE]}
     with processes.simulating(command.jobs) as mapped:
         judge = external.judge_in(command.simulator, config, terrain, mapped)
-        given, key = bool(config.terrain), config.key("testing")
-        groups = report.drive(test.env, test.params, policies, key, judge, given)
+        suites = None if config.terrain else config.ground.world_suites
+        key = config.key("testing")
+        groups = report.drive(test.env, test.params, policies, key, suites, judge)
     print(f"\n{report.markdown(groups, REFERENCE)}")
     if command.output:
         radius = config.navigation.goal_radius

@@ -1,6 +1,5 @@
 """Action repeat: an environment whose actions are held for several steps."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,12 +8,11 @@ import jax.numpy as jnp
 from gymnax.environments import spaces
 from gymnax.environments.environment import Environment
 
-Controller = Callable[[jax.Array, Any], jax.Array]
-"""`(observation [..., O], key)` to actions `[..., A]` in [-1, 1]."""
+from vertiwm_jax.env.agent import Policy
 
 
 def corrected(
-    base: Controller | None, observation: jax.Array, key: Any, correction: jax.Array
+    base: Policy | None, observation: jax.Array, key: jax.Array, correction: jax.Array
 ) -> jax.Array:
     """The action `[..., A]` of a controller plus a correction; without a base, the correction."""
     if base is None:
@@ -36,7 +34,7 @@ class ActionRepeat(Environment):
 
     env: Environment
     times: int
-    base: Controller | None = None
+    base: Policy | None = None
 
     def reset_env(self, key: jax.Array, params: Any) -> tuple[jax.Array, Any]:
         return self.env.reset_env(key, params)
@@ -59,9 +57,6 @@ class ActionRepeat(Environment):
 
     def is_truncated(self, state: Any, params: Any) -> jax.Array:
         return self.env.is_truncated(state, params)
-
-    def is_terminated(self, state: Any, params: Any) -> jax.Array:
-        return self.env.is_terminated(state, params)
 
     def action_space(self, params: Any) -> spaces.Box:
         return self.env.action_space(params)

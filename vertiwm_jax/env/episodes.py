@@ -18,6 +18,8 @@ from vertiwm_jax.state import STEP_SECONDS
 
 Keep = Callable[[TaskParams, TaskState], Any]
 """What is kept of the parameters of a task and of each state of an episode."""
+Episode = tuple[Memory, jax.Array, TaskState]
+"""An agent's memory, the observation, and where the episode stands; or leaves `[P, ...]` of P."""
 
 
 @struct.dataclass
@@ -122,81 +124,66 @@ def _run(
     agent: Agent,
     key: jax.Array,
 ) -> NavigationResult:
-    count = task.pool_size
-    observation, start = parallel.vmap(env.start, (None, 0))(task, jnp.arange(count))
+    count, interval = task.pool_size, agent.interval
+    planning = jax.random.fold_in(key, length)
 
-    def init(agent: Agent, task: TaskParams, state: TaskState, observation: jax.Array) -> Memory:
-        return agent.init(Now(task, state, observation))
+    @partial(parallel.vmap, in_axes=(None, None, 0))
+    def begin(agent: Agent, task: TaskParams, number: jax.Array) -> Episode:
+        observation, state = env.start(task, number)
+        return agent.init(Now(task, state, observation)), observation, state
 
     @partial(parallel.vmap, in_axes=(None, 0))
-    def kept(task: TaskParams, state: TaskState) -> tuple:
+    def kept(task: TaskParams, state: TaskState) -> tuple[jax.Array, jax.Array, Any]:
         more = keep(task, state) if keep else None
         return state.vehicle.position, state.vehicle.rpy, more
 
-    @partial(parallel.vmap, in_axes=(None, None, 0, 0, 0, 0))
-    def drive(
-        agent: Agent,
-        task: TaskParams,
-        memory: Memory,
-        observation: jax.Array,
-        state: TaskState,
-        key: jax.Array,
-    ) -> tuple[Memory, jax.Array, TaskState]:
+    @partial(parallel.vmap, in_axes=(None, None, 0, 0))
+    def drive(agent: Agent, task: TaskParams, episode: Episode, key: jax.Array) -> Episode:
+        memory, observation, state = episode
         key_agent, key_step = jax.random.split(key)
         action, memory = agent.act(Now(task, state, observation), memory, key_agent)
         observation, state, *_ = env.step_env(key_step, state, action, task)
         return memory, observation, state
 
-    def advance(carry: tuple, _: None) -> tuple[tuple, None]:
-        step, memory, observation, state, paths = carry
+    def advance(episodes: Episode, step: jax.Array) -> tuple[Episode, tuple]:
         keys = jax.random.split(jax.random.fold_in(key, step), count)
-        memory, observation, state = drive(agent, task, memory, observation, state, keys)
-        step = step + 1
-        paths = jax.tree.map(lambda path, x: path.at[step].set(x), paths, kept(task, state))
-        return (step, memory, observation, state, paths), None
+        episodes = drive(agent, task, episodes, keys)
+        return episodes, kept(task, episodes[2])
 
-    def drive_on(carry: tuple) -> tuple:
-        step, memory, observation, state, paths = carry
+    def drive_on(episodes: Episode, step: jax.Array) -> tuple[Episode, tuple]:
         keys = jax.random.split(jax.random.fold_in(planning, step), count)
-        memory = _plan(agent, task, memory, observation, state, keys)
-        carry = step, memory, observation, state, paths
-        return jax.lax.scan(advance, carry, length=agent.interval)[0]
+        episodes = _plan(agent, task, episodes, keys)
+        return jax.lax.scan(advance, episodes, step + jnp.arange(interval))
 
-    def unless_over(carry: tuple, _: None) -> tuple[tuple, None]:
-        running = jnp.any(carry[3].ending == TerminationReason.RUNNING)
-        return jax.lax.cond(running, drive_on, lambda over: over, carry), None
+    def stay(episodes: Episode, step: jax.Array) -> tuple[Episode, tuple]:
+        last = kept(task, episodes[2])
+        return episodes, jax.tree.map(lambda x: jnp.broadcast_to(x, (interval, *x.shape)), last)
 
-    # Steps after the time limit, to fill an interval, change nothing: all episodes are over.
-    planning = jax.random.fold_in(key, length)
-    memory = parallel.vmap(init, (None, None, 0, 0))(agent, task, start, observation)
-    paths = jax.tree.map(lambda x: jnp.broadcast_to(x, (length + 1, *x.shape)), kept(task, start))
-    carry = jnp.int32(0), memory, observation, start, paths
-    # Not a `while_loop`: on CPUs XLA runs what is inside one several times slower.
-    decisions = -(-length // agent.interval)
-    (last, _, _, end, paths), _ = jax.lax.scan(unless_over, carry, length=decisions)
+    def decide(episodes: Episode, step: jax.Array) -> tuple[Episode, tuple]:
+        running = jnp.any(episodes[2].ending == TerminationReason.RUNNING)
+        return jax.lax.cond(running, drive_on, stay, episodes, step)
 
-    def filled(path: jax.Array, x: jax.Array) -> jax.Array:
-        after = jnp.arange(length + 1) > last
-        return jnp.where(jnp.expand_dims(after, range(1, path.ndim)), x, path)
+    first = begin(agent, task, jnp.arange(count))
+    # Not a `while_loop`: on CPUs XLA runs what is inside one several times slower. Steps after the
+    # time limit, to fill an interval, change nothing: all episodes are over.
+    (_, _, end), paths = jax.lax.scan(decide, first, jnp.arange(0, length, interval))
 
-    return result(end, *jax.tree.map(filled, paths, kept(task, end)))
+    def joined(start: jax.Array, path: jax.Array) -> jax.Array:
+        path = path.reshape(-1, *path.shape[2:])
+        return jnp.concatenate([start[None], path[:length]])
+
+    return result(end, *jax.tree.map(joined, kept(task, first[2]), paths))
 
 
-def _plan(
-    agent: Agent,
-    task: TaskParams,
-    memory: Memory,
-    observation: jax.Array,
-    state: TaskState,
-    keys: jax.Array,
-) -> Memory:
-    """Memories, leaves `[P, ...]`, with plans of those that still drive.
+def _plan(agent: Agent, task: TaskParams, episodes: Episode, keys: jax.Array) -> Episode:
+    """Episodes, leaves `[P, ...]`, whose memories have plans where they still drive.
 
     Planners imagine many futures of each vehicle, so that a few at a time fill the devices, and
     none are imagined once a task is over.
     """
     if type(agent).plan is Agent.plan:
-        return memory
+        return episodes
+    memory, observation, state = episodes
     running = state.ending == TerminationReason.RUNNING
     of_device = machine.together(cpu=8, accelerator=128)
     together = min(of_device * parallel.number(), len(running))
@@ -205,25 +192,20 @@ def _plan(
     filled = np.minimum(np.arange(turns * together), len(running) - 1)
     rows = jnp.argsort(~running)[filled].reshape(turns, together)
 
-    @partial(parallel.vmap, in_axes=(None, None, 0, 0, 0, 0))
-    def plan(
-        agent: Agent,
-        task: TaskParams,
-        memory: Memory,
-        observation: jax.Array,
-        state: TaskState,
-        key: jax.Array,
-    ) -> Memory:
+    @partial(parallel.vmap, in_axes=(None, None, 0, 0))
+    def plan(agent: Agent, task: TaskParams, episode: Episode, key: jax.Array) -> Memory:
+        memory, observation, state = episode
         return agent.plan(Now(task, state, observation), memory, key)
 
     def turn(rows: jax.Array) -> Memory:
-        of_some = jax.tree.map(lambda x: x[rows], (memory, observation, state, keys))
+        some, own = jax.tree.map(lambda x: x[rows], (episodes, keys))
         return jax.lax.cond(
             jnp.any(running[rows]),
-            lambda some: plan(agent, task, *some),
+            lambda some: plan(agent, task, some, own),
             lambda some: some[0],
-            of_some,
+            some,
         )
 
     planned = jax.lax.map(turn, rows)
-    return jax.tree.map(lambda x, y: x.at[rows].set(y, mode="promise_in_bounds"), memory, planned)
+    memory = jax.tree.map(lambda x, y: x.at[rows].set(y, mode="promise_in_bounds"), memory, planned)
+    return memory, observation, state

@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from vertiwm_jax.env import render
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.render import from_above
 from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.state import STEP_SECONDS
@@ -28,21 +28,8 @@ def _spaces(env: NavigationEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.
 
 
 # Equal environments share what these compile.
-@partial(jax.jit, static_argnames="env")
-def _reset(env: NavigationEnv, key: jax.Array, params: TaskParams) -> tuple[jax.Array, TaskState]:
-    return env.reset_env(key, params)
-
-
-@partial(jax.jit, static_argnames="env")
-def _step(
-    env: NavigationEnv,
-    key: jax.Array,
-    state: TaskState,
-    action: jax.Array,
-    params: TaskParams,
-) -> tuple[Any, ...]:
-    result = env.step_env(jax.random.fold_in(key, state.time), state, action, params)
-    return *result, env.is_truncated(result[1], params)
+_reset = jax.jit(NavigationEnv.reset_env, static_argnums=0)
+_step = jax.jit(NavigationEnv.step_env, static_argnums=0)
 
 
 @partial(jax.jit, static_argnames=("env", "count"))
@@ -54,11 +41,7 @@ def _reset_all(
 
 @partial(jax.jit, static_argnames="env")
 def _step_all(
-    env: NavigationEnv,
-    key: jax.Array,
-    states: TaskState,
-    actions: jax.Array,
-    params: TaskParams,
+    env: NavigationEnv, key: jax.Array, states: TaskState, actions: jax.Array, params: TaskParams
 ) -> tuple[Any, ...]:
     keys = jax.random.split(key, len(actions))
     return jax.vmap(env.step, (0, 0, 0, None))(keys, states, actions, params)
@@ -95,27 +78,19 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """One step of 0.1 s, without reset at the end."""
         if self._state is None:
             raise gymnasium.error.ResetNeeded("step: call reset() first")
-        observation, self._state, reward, terminated, info, truncated = _step(
+        observation, self._state, reward, terminated, info = _step(
             self._env, self._key, self._state, action, self._params
         )
         info = {name: value.item() for name, value in _named(info).items()}
-        return np.asarray(observation), reward.item(), bool(terminated), bool(truncated), info
+        truncated = info["ending"] == "timed_out"
+        return np.asarray(observation), reward.item(), bool(terminated), truncated, info
 
     def render(self) -> np.ndarray | None:
         """`[H, W, 3]` uint8, north up, or None without a render mode."""
         if self.render_mode is None or self._state is None:
             return None
-        state = jax.tree.map(np.asarray, self._state)
-        vehicle, config = state.vehicle, self._env.config
-        return render.from_above(
-            self._params.terrain,
-            int(state.world),
-            vehicle.position,
-            float(vehicle.rpy[2]),
-            state.goal,
-            config.goal_radius,
-            self._params.vehicle,
-        )
+        radius = self._env.config.goal_radius
+        return from_above(self._params.terrain, self._params.vehicle, self._state, radius)
 
     def _start(self) -> tuple[jax.Array, TaskState]:
         return _reset(self._env, self._key, self._params)

@@ -3,26 +3,38 @@
 import dataclasses
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from gymnax.environments import environment, spaces
 
-from vertiwm_jax.dynamics import Dynamics, Params, disagreement, spread, step
-from vertiwm_jax.env import observation, suites
+from vertiwm_jax import machine, parallel, xla
+from vertiwm_jax.dynamics import (
+    Dynamics,
+    History,
+    Params,
+    disagreement,
+    embedding,
+    spread,
+    step,
+)
+from vertiwm_jax.env import observation, route, suites
 from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
-from vertiwm_jax.env.resets import ResetPool
 from vertiwm_jax.env.reward import reward
 from vertiwm_jax.env.suites import GroundConfig
-from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState, see
-from vertiwm_jax.env.tasks import Tasks
+from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState
+from vertiwm_jax.env.tasks import TaskError, Tasks, validate
 from vertiwm_jax.env.termination import TerminationReason, edge_distance, first_ending, is_terminal
+from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, load_vehicle
 from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
 from vertiwm_jax.perception.features import Encoders
-from vertiwm_jax.state import STEP_SECONDS, VehicleState
-from vertiwm_jax.terrain import obstacles, query, sensing
+from vertiwm_jax.perception.perceive import embed
+from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
+from vertiwm_jax.terrain import obstacles, patches, query, sensing
+from vertiwm_jax.terrain.files import load_map
 from vertiwm_jax.terrain.map import TerrainMap
 
 
@@ -45,6 +57,8 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         tasks: Tasks,
         vehicle: Vehicle | None = None,
         encoders: Encoders | None = None,
+        *,
+        settled: bool = True,
     ) -> TaskParams:
         """Parameters whose pool of starts is `tasks`, each settled on the ground by the model.
 
@@ -54,27 +68,44 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
             tasks: on these worlds.
             vehicle: what the model moves; an HMMWV by default.
             encoders: by which policies see the ground, where the model does not keep what it sees.
+            settled: if false, nothing is settled, and the starts are shapes alone. That is enough
+                to restore what was learned with such parameters, or to compile a training.
 
         Raises:
             ValueError: names the first task that cannot be driven, or whose settled state is not
                 finite.
         """
-        return self._pool.settled(dynamics, vehicle or load_vehicle(), encoders, terrain, tasks)
-
-    def shapes(
-        self,
-        dynamics: Params,
-        terrain: TerrainMap,
-        tasks: Tasks,
-        vehicle: Vehicle | None = None,
-        encoders: Encoders | None = None,
-    ) -> TaskParams:
-        """What `make_params` gives, but for the starts, of which only shapes are known.
-
-        Enough to restore what was learned with such parameters, or to compile what will be, without
-        settling anything. Tasks that cannot be driven raise as there.
-        """
-        return self._pool.shapes(dynamics, vehicle or load_vehicle(), encoders, terrain, tasks)
+        config, vehicle, pool = self.config, vehicle or load_vehicle(), len(tasks.world)
+        reach = float(np.hypot(vehicle.wheelbase, vehicle.track)) / 2
+        patches.footprint_covered(reach, max(map(abs, config.speed_range)))
+        sensing.check(config.sensing, terrain)
+        validate(tasks, terrain, config.goal_radius, config.map_margin)
+        if config.sensing.partial or not settled:
+            routes = route.straight(config.route, terrain, tasks.goal)
+        else:
+            routes = route.plan(config.route, terrain, vehicle, tasks.world, tasks.goal)
+        params = TaskParams(
+            max_steps_in_episode=jnp.int32(round(config.horizon_seconds / STEP_SECONDS)),
+            dynamics=dynamics,
+            vehicle=jax.tree.map(jnp.asarray, vehicle),
+            encoders=encoders,
+            terrain=terrain,
+            routes=routes,
+            starts=cast(TaskState, ()),
+            start_observation=cast(jax.Array, ()),
+        )
+        together = min(_chunk() * jax.device_count(), pool)
+        given = params, tasks, jnp.arange(pool)
+        if settled:
+            starts, seen = parallel.shared_out(partial(_settle_once, self), together)(*given)
+            _check_finite(starts, tasks, config)
+        else:
+            # As they will settle, so that it is traced only once.
+            mesh = parallel.mesh(together)
+            with jax.set_mesh(mesh):
+                given = parallel.place(mesh, given)
+                starts, seen = jax.eval_shape(partial(_settle, self), *given)
+        return dataclasses.replace(params, starts=starts, start_observation=seen)
 
     def start(self, params: TaskParams, index: jax.Array) -> tuple[jax.Array, TaskState]:
         """Observation and state of start `[]` of the pool."""
@@ -104,13 +135,10 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         terrain = params.terrain.select(state.world)
         action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
         arriving, variation = state.variation.arriving(action)
-        ground, command = (
-            state.variation.ground(terrain),
-            params.vehicle.command(arriving, config.speed_range),
-        )
-        moved, history = step(
-            self.dynamics, params.dynamics, ground, state.history, state.vehicle, command
-        )
+        ground = state.variation.ground(terrain)
+        command = params.vehicle.command(arriving, config.speed_range)
+        given = params.dynamics, ground, state.history, state.vehicle, command
+        moved, history = step(self.dynamics, *given)
         running = state.ending == TerminationReason.RUNNING
         apart = disagreement(history)
         plausible = self._is_plausible(terrain, moved, apart)
@@ -186,11 +214,23 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         action: int | float | jax.Array | None,
         params: TaskParams,
     ) -> jax.Array:
-        """`[O]` float32, see `observation.observe`, and the ground as encoders see it."""
+        """`[O]` float32, see `observation.observe`, and the ground as encoders see it.
+
+        `ValueError` where there is nothing to see by.
+        """
         del key, action
-        routes = params.routes.select(state.route)
-        terrain = params.observed_map(state)
-        return see(self.config, terrain, params.vehicle, routes, state, params.encoders)
+        terrain, latents = params.observed_map(state), None
+        if self.config.embeddings:
+            latents = embedding(state.history)
+            if latents is None:
+                if params.encoders is None:
+                    raise ValueError(
+                        "embeddings: expected a model that was loaded with them, or encoders to "
+                        "see by, found neither; see models.registry.load_encoders"
+                    )
+                latents = embed(params.encoders, terrain, state.vehicle)
+        seen = state.vehicle, state.goal, params.routes.select(state.route), state.action
+        return observation.observe(terrain, params.vehicle, *seen, latents)
 
     def is_terminated(self, state: TaskState, params: TaskParams) -> jax.Array:
         """Whether the task itself is over."""
@@ -209,10 +249,6 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         limit, size = observation.OBSERVATION_LIMIT, self.config.observed.size
         return spaces.Box(-limit, limit, (size,), jnp.float32)
 
-    @property
-    def _pool(self) -> ResetPool:
-        return ResetPool(self.dynamics, self.config, self.variation)
-
     def _is_plausible(
         self, terrain: TerrainMap, vehicle: VehicleState, apart: jax.Array
     ) -> jax.Array:
@@ -225,8 +261,90 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         )
 
 
+def _chunk() -> int:
+    """Vehicles that a device settles at a time: patches of thousands of them fill gigabytes."""
+    return machine.together(cpu=64, accelerator=1024)
+
+
+@partial(jax.jit, static_argnames="env")
+def _settle(
+    env: NavigationEnv, params: TaskParams, tasks: Tasks, numbers: jax.Array
+) -> tuple[TaskState, jax.Array]:
+    """States and observations of vehicles at rest, leaves `[P, ...]` and `[P, O]`.
+
+    params: without starts; numbers: `[P]` int32, of the routes to the goals.
+    """
+    return parallel.batched(partial(_settle_some, env), (None, 0, 0), _chunk())(
+        params, tasks, numbers
+    )
+
+
+# Apart, for what is traced inside of something else, as for its shapes, has no compiler options.
+_settle_once = xla.brief_jit(_settle, static_argnames="env")
+
+
+def _settle_some(
+    env: NavigationEnv, params: TaskParams, tasks: Tasks, numbers: jax.Array
+) -> tuple[TaskState, jax.Array]:
+    """As `_settle`, all at once."""
+    model, config = env.dynamics, env.config
+    standing = Command(jnp.float32(0), jnp.float32(0))
+
+    def begin(task: Tasks) -> tuple[VehicleState, History]:
+        terrain = params.terrain.select(task.world)
+        state = place(terrain, task.start, task.yaw, vehicle=params.vehicle)
+        return state, model.init(params.dynamics, terrain, state)
+
+    def stand(task: Tasks, state: VehicleState, history: History) -> tuple[VehicleState, History]:
+        terrain = params.terrain.select(task.world)
+        return step(model, params.dynamics, terrain, history, state, standing)
+
+    def start(
+        task: Tasks, number: jax.Array, vehicle: VehicleState, history: History
+    ) -> tuple[TaskState, jax.Array]:
+        terrain, zero = params.terrain.select(task.world), jnp.int32(0)
+        action = params.vehicle.action(standing, config.speed_range)
+        state = TaskState(
+            time=zero,
+            vehicle=vehicle,
+            history=history,
+            world=task.world,
+            goal=jnp.append(task.goal, query.height(terrain, task.goal)),
+            route=number,
+            action=action,
+            stalled=zero,
+            ending=zero,
+            variation=DomainRandomization.draw(env.variation, jax.random.key(0), action),
+            observed=sensing.init(config.sensing, terrain, vehicle.position, vehicle.rpy[2]),
+        )
+        return state, env.observe(None, state, None, params)
+
+    # Steps of all, and not all steps of each: inside of `vmap`, a scan is traced again until it is
+    # known what of a history differs between vehicles.
+    at_rest, _ = jax.lax.scan(
+        lambda moved, _: (jax.vmap(stand)(tasks, *moved), None),
+        jax.vmap(begin)(tasks),
+        length=config.settle_steps,
+    )
+    return jax.vmap(start)(tasks, numbers, *at_rest)
+
+
+def _check_finite(starts: TaskState, tasks: Tasks, config: NavigationConfig) -> None:
+    """`TaskError` names the first task whose settled state is not finite."""
+    states = np.asarray(starts.vehicle.vector)
+    finite = np.all(np.isfinite(states), axis=-1)
+    if not finite.all():
+        i = int(np.argmin(finite))
+        raise TaskError(
+            f"dynamics: expected a finite state after {config.settle_steps} steps of standing "
+            f"still, found {states[i]} in task {i} (world {int(tasks.world[i])}, start "
+            f"{np.asarray(tasks.start)[i].tolist()}); {np.sum(~finite)} of {finite.size} tasks "
+            "are so"
+        )
+
+
 def make_env(
-    terrain: TerrainMap | None = None,
+    terrain: TerrainMap | str | Path | None = None,
     model: Imagined = "builtin",
     *,
     vehicle: str | Vehicle = HMMWV,
@@ -238,7 +356,8 @@ def make_env(
     """Makes the task of driving across maps as an environment, a step of which is 0.1 s.
 
     Args:
-        terrain: W worlds; by default two procedural ones of each suite that policies are tested on.
+        terrain: W worlds, or a map file, or a folder of maps; by default two procedural worlds of
+            each suite that policies are tested on.
         model: what moves the vehicle, see `load_model`.
         vehicle: a vehicle, the name of one that comes along, or a YAML file of one; learned models
             move the one that they were fitted to.
@@ -258,10 +377,12 @@ def make_env(
         ConfigError, CheckpointError: there is no such vehicle, or no such model.
     """
     driven = load_vehicle(vehicle) if isinstance(vehicle, str) else vehicle
-    if terrain is None:
-        terrain = suites.suite_worlds(GroundConfig(suite_worlds=2), jax.random.key(seed))
     dynamics, params = load_model(model, weights, vehicle=driven, embeddings=config.embeddings)
     env = NavigationEnv(dynamics, config)
+    if terrain is None:
+        terrain = suites.suite_worlds(GroundConfig(suite_worlds=2), jax.random.key(seed))
+    elif not isinstance(terrain, TerrainMap):
+        terrain = load_map(terrain)
     encoders = load_encoders(weights) if config.embeddings else None
     tasks = suites.test_tasks(GroundConfig(pairs=pairs), terrain)
     return env, env.make_params(params, terrain, tasks, driven, encoders)

@@ -5,13 +5,13 @@ errors of its model (Peng et al., 2018, "Sim-to-real transfer with dynamics rand
 """
 
 import dataclasses
-from typing import Self
+from typing import Annotated, Self
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.config import settings
+from vertiwm_jax.config import Bounds, settings
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -22,20 +22,17 @@ _STRENGTH = "kc", "kphi", "cohesion"
 class RandomizationConfig:
     """Bounds of what each episode draws uniformly; nothing varies by default."""
 
-    grip: tuple[float, float] = (1.0, 1.0)
+    grip: Annotated[tuple[float, float], Bounds(0.01)] = (1.0, 1.0)
     """Factor on the friction of rigid ground."""
-    soil: tuple[float, float] = (1.0, 1.0)
+    soil: Annotated[tuple[float, float], Bounds(0.01)] = (1.0, 1.0)
     """Factor on stiffness and cohesion of all soils."""
-    delay: tuple[int, int] = (0, 0)
+    delay: Annotated[tuple[int, int], Bounds(0)] = (0, 0)
     """Delay of commands, in steps of 0.1 s."""
 
     def check(self):
-        for name, least in (("grip", 0.01), ("soil", 0.01), ("delay", 0)):
-            low, high = getattr(self, name)
-            if not least <= low <= high:
-                raise ValueError(
-                    f"{name}: expected least and most, from {least} up, found {low} and {high}"
-                )
+        for name, (low, high) in vars(self).items():
+            if low > high:
+                raise ValueError(f"{name}: expected least and most, found {low} and {high}")
 
 
 @struct.dataclass

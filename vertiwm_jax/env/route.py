@@ -86,10 +86,8 @@ def plan(
     config: RouteConfig, terrain: TerrainMap, vehicle: Vehicle, world: jax.Array, goal: jax.Array
 ) -> Routes:
     """Routes to goals `[P, 2]`, m, in worlds `[P]`, computed by all devices."""
-    of_worlds = parallel.shared_out(functools.partial(_all_costs, config), terrain.worlds)
-    costs = of_worlds(vehicle, terrain, jnp.arange(terrain.worlds))
-    to_goals = parallel.shared_out(_all_costs_to_go, len(world))
-    return Routes(to_goals(terrain, costs, world, goal), jnp.int32(0))
+    to_goals = parallel.shared_out(functools.partial(_plan, config), len(world))
+    return Routes(to_goals(vehicle, terrain, world, goal), jnp.int32(0))
 
 
 def plan_one(config: RouteConfig, terrain: TerrainMap, vehicle: Vehicle, goal: jax.Array) -> Routes:
@@ -106,26 +104,14 @@ def straight(config: RouteConfig, terrain: TerrainMap, goal: jax.Array) -> Route
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _all_costs(
-    config: RouteConfig, vehicle: Vehicle, terrain: TerrainMap, world: jax.Array
+def _plan(
+    config: RouteConfig, vehicle: Vehicle, terrain: TerrainMap, world: jax.Array, goal: jax.Array
 ) -> jax.Array:
-    """`[W, 16, n, n]`"""
-    each = parallel.vmap(functools.partial(_costs, config), (None, None, 0), _together())
-    return each(vehicle, terrain, world)
-
-
-@jax.jit
-def _all_costs_to_go(
-    terrain: TerrainMap, costs: jax.Array, world: jax.Array, goal: jax.Array
-) -> jax.Array:
-    """`[P, n, n]`"""
-    each = parallel.vmap(_costs_to_go, (None, None, 0, 0), _together())
-    return each(terrain, costs, world, goal)
-
-
-def _together() -> int:
-    """Goals, or worlds, that a device works at."""
-    return machine.together(cpu=1, accelerator=256)
+    """`[P, n, n]` m"""
+    together = machine.together(cpu=1, accelerator=256)
+    of_worlds = parallel.vmap(functools.partial(_costs, config), (None, None, 0), together)
+    costs = of_worlds(vehicle, terrain, jnp.arange(terrain.worlds))
+    return parallel.vmap(_costs_to_go, (None, None, 0, 0), together)(terrain, costs, world, goal)
 
 
 def _costs(

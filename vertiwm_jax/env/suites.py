@@ -1,7 +1,6 @@
 """Worlds to train on, worlds kept for tests, and the tasks on both."""
 
 import logging
-import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,7 +13,7 @@ from vertiwm_jax.env.tasks import Tasks, circle_tasks, random_tasks
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.terrain import files, worlds
 from vertiwm_jax.terrain.map import TerrainMap, stack
-from vertiwm_jax.terrain.worlds import MEDIAN_SLOPE_DEG, WorldConfig
+from vertiwm_jax.terrain.worlds import WorldConfig
 
 _log = logging.getLogger(__name__)
 
@@ -54,6 +53,11 @@ class GroundConfig:
     def check(self) -> None:
         if self.held_out_every == 1:
             raise ValueError("held_out_every: expected 0, or 2 and more to train on some, found 1")
+
+    @property
+    def world_suites(self) -> list[Suite]:
+        """The suite of each world that `suite_worlds` draws."""
+        return [name for name in SUITES if name in self.suites for _ in range(self.suite_worlds)]
 
 
 def grounds(
@@ -108,29 +112,3 @@ def test_tasks(config: GroundConfig, terrain: TerrainMap) -> Tasks:
     return circle_tasks(
         terrain, min(worlds.START_RADIUS, 15 / 16 * half), config.pairs, config.sway
     )
-
-
-def suites(terrain: TerrainMap) -> list[str]:
-    """The suite that each world belongs to; rough worlds with obstacles are of two."""
-    names = {(False, False): "easy", (True, False): "hard", (False, True): "obstacles"}
-    return [
-        names.get((name in ("high", "extreme"), any(heights > 0)), "hard, obstacles")
-        for name, heights in zip(
-            difficulties(terrain), np.asarray(terrain.obstacles[..., 4]), strict=True
-        )
-    ]
-
-
-def difficulties(terrain: TerrainMap) -> list[str]:
-    """The preset of difficulty whose median slope is nearest to that of each world."""
-    names = list(MEDIAN_SLOPE_DEG)
-    presets = np.array(list(MEDIAN_SLOPE_DEG.values()))
-    slopes = map(_median_slope_deg, np.asarray(terrain.elevation) / float(terrain.resolution))
-    return [names[int(np.argmin(np.abs(presets - slope)))] for slope in slopes]
-
-
-def _median_slope_deg(heights: np.ndarray) -> float:
-    """Of the two triangles of each cell; `heights` in units of the resolution."""
-    x, y = np.diff(heights, axis=1), np.diff(heights, axis=0)
-    slopes = np.hypot((x[:-1], x[1:]), (y[:, :-1], y[:, 1:]))
-    return math.degrees(math.atan(np.median(slopes)))

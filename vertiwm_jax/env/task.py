@@ -9,15 +9,14 @@ from flax import struct
 from gymnax.environments import environment
 
 from vertiwm_jax.config import settings
-from vertiwm_jax.dynamics import History, Params, embedding
-from vertiwm_jax.env import observation, route
+from vertiwm_jax.dynamics import History, Params
+from vertiwm_jax.env import route
 from vertiwm_jax.env.observation import ObservationSpec
 from vertiwm_jax.env.randomization import DomainRandomization
 from vertiwm_jax.env.reward import RewardConfig
 from vertiwm_jax.env.route import RouteConfig, Routes
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.perception.features import Encoders
-from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.map import ObservedMap, TerrainMap
 from vertiwm_jax.terrain.sensing import SensingConfig
@@ -141,28 +140,3 @@ class TaskParams(environment.EnvParams):
         if state.observed is None:
             return terrain
         return dataclasses.replace(terrain, observed=state.observed)
-
-
-def see(
-    config: NavigationConfig,
-    terrain: TerrainMap,
-    vehicle: Vehicle,
-    routes: Routes,
-    state: TaskState,
-    encoders: Encoders | None,
-) -> jax.Array:
-    """`[O]` float32, see `observation.observe`, and the ground as encoders see it.
-
-    terrain: as far as the vehicle has seen it; routes: with that to its goal selected; encoders: of
-    `TaskParams`. `ValueError` where there is nothing to see by.
-    """
-    latents = embedding(state.history) if config.embeddings else None
-    if config.embeddings and latents is None:
-        if encoders is None:
-            raise ValueError(
-                "embeddings: expected a model that was loaded with them, or encoders to see by, "
-                "found neither; see models.registry.load_encoders"
-            )
-        latents = embed(encoders, terrain, state.vehicle)
-    own = state.vehicle, state.goal, routes, state.action
-    return observation.observe(terrain, vehicle, *own, latents)

@@ -1,6 +1,5 @@
 """Navigation tasks: start, heading and goal."""
 
-import dataclasses
 import functools
 import math
 
@@ -20,6 +19,13 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 _SURROUNDINGS = 4.0  # m
 _SWAYS = 13  # places that a pair of the circle may turn to
+# Of random tasks:
+_DISTANCE = 20.0, 115.0  # m, least and largest from start to goal
+_HEADING_ERROR = math.pi / 3  # rad, largest between the heading at the start and the goal
+_STEEPEST = math.radians(20)  # of a start, under the wheels, and as a mean of its surroundings
+_CLEARANCE = 1.0  # m that start and goal keep from obstacles
+_MARGIN = 4.0  # m that they keep from the edge of the map
+_CANDIDATES = 128  # drawn for each task; the first acceptable one is taken
 
 
 class TaskError(UserError, ValueError):
@@ -40,27 +46,6 @@ class Tasks:
     start: jax.Array
     yaw: jax.Array
     goal: jax.Array
-
-
-@dataclasses.dataclass(frozen=True)
-class RandomTaskConfig:
-    """Conditions on random tasks.
-
-    distance: least and largest distance from start to goal, m.
-    heading_error: rad, largest angle between the heading at the start and the goal.
-    steepest_start: largest slope of the ground under the wheels, rad.
-    roughest_start: largest root mean square slope within 4 m, rad.
-    clearance, margin: m that start and goal keep from obstacles and from the map's edge.
-    candidates: number drawn for each task; the first acceptable one is taken.
-    """
-
-    distance: tuple[float, float] = (20.0, 115.0)
-    heading_error: float = math.pi / 3
-    steepest_start: float = math.radians(20)
-    roughest_start: float = math.radians(20)
-    clearance: float = 1.0
-    margin: float = 4.0
-    candidates: int = 128
 
 
 def circle_tasks(
@@ -117,65 +102,60 @@ def slope_around(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     return jnp.arctan(jnp.sqrt(jnp.mean(jnp.sum(gradient**2, axis=-1), axis=-1)))
 
 
-def random_tasks(
-    key: jax.Array,
-    terrain: TerrainMap,
-    count: int,
-    vehicle: Vehicle,
-    config: RandomTaskConfig = RandomTaskConfig(),
-) -> Tasks:
+def random_tasks(key: jax.Array, terrain: TerrainMap, count: int, vehicle: Vehicle) -> Tasks:
     """`count` random tasks, spread evenly over the worlds.
 
-    `ValueError` if no candidate was acceptable for some task.
+    Starts are level enough to leave, and goals lie roughly ahead, 20 to 115 m away. `ValueError` if
+    no candidate was acceptable for some task.
     """
-    tasks, found = _draw(key, terrain, count, vehicle, config)
+    tasks, found = _draw(key, terrain, count, vehicle)
     missing = int(count - found.sum())
     if missing:
         worlds = np.unique(np.asarray(tasks.world)[~np.asarray(found)])
         raise TaskError(
-            f"random_tasks: no acceptable start and goal among {config.candidates} candidates "
-            f"for {missing} of {count} tasks, on worlds {worlds[:8].tolist()}; allow a steeper "
-            "start, a shorter distance, less clearance or more candidates"
+            f"random_tasks: no acceptable start and goal among {_CANDIDATES} candidates "
+            f"for {missing} of {count} tasks, on worlds {worlds[:8].tolist()}: each is to lie "
+            f"{_MARGIN:g} m inside the map, {_DISTANCE[0]:g} m and more from the other, clear of "
+            f"obstacles, and the start on ground of at most {math.degrees(_STEEPEST):.0f} deg"
         )
     return tasks
 
 
-@functools.partial(xla.brief_jit, static_argnames=("count", "config"))
+@functools.partial(xla.brief_jit, static_argnames="count")
 def _draw(
-    key: jax.Array, terrain: TerrainMap, count: int, vehicle: Vehicle, config: RandomTaskConfig
+    key: jax.Array, terrain: TerrainMap, count: int, vehicle: Vehicle
 ) -> tuple[Tasks, jax.Array]:
     low, high = terrain.extent
-    low, high = low + config.margin, high - config.margin
+    bounds = low + _MARGIN, high - _MARGIN
+    size = vehicle.length + 2 * _CLEARANCE, vehicle.width + 2 * _CLEARANCE
 
     def draw(inputs: tuple[jax.Array, jax.Array]) -> tuple[Tasks, jax.Array]:
         key, world = inputs
         selected = terrain.select(world)
-        shape = (config.candidates, 2)
         key_start, key_goal, key_yaw = jax.random.split(key, 3)
-        start = jax.random.uniform(key_start, shape, minval=low, maxval=high)
-        goal = jax.random.uniform(key_goal, shape, minval=low, maxval=high)
+        shape = _CANDIDATES, 2
+        start = jax.random.uniform(key_start, shape, jnp.float32, *bounds)
+        goal = jax.random.uniform(key_goal, shape, jnp.float32, *bounds)
         offset = goal - start
-        yaw = jnp.arctan2(offset[:, 1], offset[:, 0]) + jax.random.uniform(
-            key_yaw, shape[:1], minval=-config.heading_error, maxval=config.heading_error
+        error = jax.random.uniform(
+            key_yaw, shape[:1], minval=-_HEADING_ERROR, maxval=_HEADING_ERROR
         )
+        yaw = jnp.arctan2(offset[:, 1], offset[:, 0]) + error
         distance = jnp.linalg.norm(offset, axis=-1)
-        near_enough = (distance >= config.distance[0]) & (distance <= config.distance[1])
-        length = vehicle.length + 2 * config.clearance
-        width = vehicle.width + 2 * config.clearance
+        near_enough = (distance >= _DISTANCE[0]) & (distance <= _DISTANCE[1])
 
         def is_acceptable(i: jax.Array) -> jax.Array:
             roll, pitch, _ = place(selected, start[i], yaw[i], vehicle=vehicle).rpy
             tilt = jnp.arccos(jnp.cos(roll) * jnp.cos(pitch))
-            level = slope_around(selected, start[i]) <= config.roughest_start
+            level = slope_around(selected, start[i]) <= _STEEPEST
             ends = jnp.stack([start[i], goal[i]])
-            blocked = obstacles.collides(selected, ends, yaw[i][None], length, width)
-            return near_enough[i] & (tilt <= config.steepest_start) & level & ~jnp.any(blocked)
+            blocked = obstacles.collides(selected, ends, yaw[i][None], *size)
+            return near_enough[i] & (tilt <= _STEEPEST) & level & ~jnp.any(blocked)
 
         first = jax.lax.while_loop(
-            lambda i: (i < config.candidates) & ~is_acceptable(i), lambda i: i + 1, jnp.int32(0)
+            lambda i: (i < _CANDIDATES) & ~is_acceptable(i), lambda i: i + 1, jnp.int32(0)
         )
-        found = first < config.candidates
-        return Tasks(world, start[first], yaw[first], goal[first]), found
+        return Tasks(world, start[first], yaw[first], goal[first]), first < _CANDIDATES
 
     world = jnp.arange(count, dtype=jnp.int32) % terrain.worlds
     # In batches, small ones on CPUs, since each goes on until the last task of it is found.
@@ -189,8 +169,8 @@ def _edge_distances(terrain: TerrainMap, tasks: Tasks) -> tuple[jax.Array, jax.A
     return edge_distance(terrain, tasks.start), edge_distance(terrain, tasks.goal)
 
 
-def validate(tasks: Tasks, terrain: TerrainMap, goal_radius: float, margin: float) -> Tasks:
-    """The same tasks; `ValueError` names the first that cannot be driven.
+def validate(tasks: Tasks, terrain: TerrainMap, goal_radius: float, margin: float) -> None:
+    """`ValueError` names the first task that cannot be driven.
 
     Starts must lie `margin` m inside the map and farther than `goal_radius` m from the goal.
     """
@@ -213,4 +193,3 @@ def validate(tasks: Tasks, terrain: TerrainMap, goal_radius: float, margin: floa
                 f"start {np.asarray(tasks.start)[i].tolist()}, "
                 f"goal {np.asarray(tasks.goal)[i].tolist()}, yaw {float(tasks.yaw[i]):g}"
             )
-    return tasks

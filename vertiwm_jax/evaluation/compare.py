@@ -163,7 +163,7 @@ def _judge(
         test = external.test_in(simulator, settings, terrain)
         judge = external.judge_in(simulator, settings, terrain, mapped)
         key = settings.key("testing")
-        driven = report.drive(test.env, test.params, policies, key, judge)
+        driven = report.drive(test.env, test.params, policies, key, grounds.world_suites, judge)
         for suite, results in driven.items():
             groups.setdefault(suite, {}).update(results)
     return dict(groups)

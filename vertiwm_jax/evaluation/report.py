@@ -13,7 +13,6 @@ import jax
 import numpy as np
 
 from vertiwm_jax import atomic, figures, machine, runs
-from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.episodes import NavigationResult, run_episodes
@@ -59,7 +58,8 @@ def after_training(trained: Trained) -> str:
     test = experiment.test_environment(config, trained.held_out)
     policies = experiment.learned(config, folder) | config.baselines
     given = trained.given or config.terrain is not None
-    groups = drive(test.env, test.params, policies, config.key("testing"), given=given)
+    suites = None if given else config.ground.world_suites
+    groups = drive(test.env, test.params, policies, config.key("testing"), suites)
     write(folder, groups, REFERENCE, test.params.terrain, config.navigation.goal_radius)
     return markdown(groups, REFERENCE)
 
@@ -69,12 +69,12 @@ def drive(
     params: TaskParams,
     policies: Mapping[str, Policy | Agent],
     key: jax.Array,
+    suites: Sequence[str] | None = None,
     judge: Judge = run_episodes,
-    given: bool = False,
 ) -> dict[str, Results]:
     """Drives all tasks of the pool with each policy; the results by suite.
 
-    given: whether the worlds are a user's own maps, which belong to no suite.
+    suites: that of each world; None where the worlds are a user's own maps.
     """
     _log.info("driving %d tasks on %d worlds ...", params.pool_size, params.terrain.worlds)
     results = {}
@@ -83,8 +83,7 @@ def drive(
         results[name] = judge(env, params, policy, key)
         solved, seconds = int(np.sum(results[name].success)), time.perf_counter() - start
         _log.info("  %s: %d solved, compiled and driven in %.0f s", name, solved, seconds)
-    of_worlds = [GIVEN_MAPS] * params.terrain.worlds if given else suites.suites(params.terrain)
-    return by_suite(results, of_worlds)
+    return by_suite(results, suites or [GIVEN_MAPS] * params.terrain.worlds)
 
 
 def by_suite(results: Results, suites: Sequence[str]) -> dict[str, Results]:

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.config import Count, NotNegative, settings
-from vertiwm_jax.env.action_repeat import Controller
-from vertiwm_jax.env.agent import Now
+from vertiwm_jax.env.agent import Now, Policy
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.planning.planner import Plan, Planner, PlannerConfig
 
@@ -42,7 +41,7 @@ class PolicyImprovement(Planner):
     config: ImprovementConfig = struct.field(pytree_node=False)
     policy: Callable[[jax.Array], jax.Array]
     value: Callable[[jax.Array], jax.Array]
-    base: Controller | None = struct.field(pytree_node=False)
+    base: Policy | None = struct.field(pytree_node=False)
     interval: int = struct.field(pytree_node=False)
     discount: float = struct.field(pytree_node=False)
 

@@ -8,7 +8,7 @@ import optax
 
 from vertiwm_jax.config import Count, Positive, Share, settings
 from vertiwm_jax.env.action_repeat import ActionRepeat
-from vertiwm_jax.rl.learned import DeterministicPolicy, TwinValue, Value
+from vertiwm_jax.rl.learned import DeterministicPolicy, Value
 from vertiwm_jax.training import Algorithm
 
 State = TypeVar("State")
@@ -79,5 +79,5 @@ class PolicyAlgorithm(Algorithm[State]):
         """What `state` has learned."""
 
     @abstractmethod
-    def value(self, data: Any, state: State) -> Value | TwinValue:
+    def value(self, data: Any, state: State) -> Value:
         """What `state` expects of its policy."""

@@ -13,7 +13,7 @@ from vertiwm_jax import machine, training
 from vertiwm_jax.config import ConfigError, Count
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import controllers, suites, tasks
-from vertiwm_jax.env.action_repeat import ActionRepeat, Controller
+from vertiwm_jax.env.action_repeat import ActionRepeat
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.randomization import RandomizationConfig
@@ -132,9 +132,9 @@ class TrainConfig(TaskConfig, ABC):
         """The algorithm on the task, as configured."""
 
     @property
-    def controller(self) -> Controller | None:
+    def controller(self) -> Policy | None:
         """What the policy corrects."""
-        return None if self.base == "none" else self.baselines[self.base]
+        return self.baselines.get(self.base)
 
     @property
     def of_policy(self) -> PolicyConfig:
@@ -330,7 +330,7 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
     moves, weights = dynamics(config, config.model)
     env = NavigationEnv(moves, config.navigation, config.variation)
     driven = config.driven.vehicle, encoders(config)
-    shapes = env.shapes(weights, terrain, pool, *driven)
+    shapes = env.make_params(weights, terrain, pool, *driven, settled=False)
     algorithm = config.algorithm(env)
     seeds = Seeds(algorithm, config.loop.seeds)
     restored = training.restore(seeds, shapes, config.resume) if config.resume else None
@@ -346,8 +346,8 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
         _log.info("training in %s on %d worlds%s", config.model, terrain.worlds, products)
 
         def keep(state: Any) -> None:
-            learned = algorithm.policy(params, state), algorithm.value(params, state)
-            policy.save(begun.folder / policy.FOLDER, config.of_policy, *learned)
+            value = algorithm.value(params, state)
+            policy.save(begun.folder / policy.FOLDER, config.of_policy, value)
 
         steps = algorithm.timesteps * config.loop.seeds
         work = Work("timesteps", steps, ("episode_return", "success"))

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.env.action_repeat import Controller, corrected
+from vertiwm_jax.env.action_repeat import corrected
+from vertiwm_jax.env.agent import Policy
 from vertiwm_jax.networks.policy import (
     ActionCritic,
     Actor,
@@ -40,32 +41,14 @@ class DeterministicPolicy:
 
 @struct.dataclass
 class Value:
-    """The return that the learned policy can expect, as far as it was learned.
+    """The return that a learned policy can expect, as far as it was learned.
 
-    critic: the network, static; params: its weights.
-    observations: statistics that its observations are normalized by; scale: `[]` of its output.
+    critic: the network, static; params: its weights. A critic of actions has two sets of them, with
+        an axis for both, and the lower value counts.
+    policy: whose return it is; scale: `[]` of the critic's output.
     """
 
-    critic: Critic = struct.field(pytree_node=False)
-    params: Any
-    observations: RunningStatistics
-    scale: jax.Array
-
-    def __call__(self, observation: jax.Array) -> jax.Array:
-        """`[..., O]` observations to `[...]` values, in units of reward."""
-        seen = self.observations.normalize(observation)
-        return self.scale * cast(jax.Array, self.critic.apply(self.params, seen))
-
-
-@struct.dataclass
-class TwinValue:
-    """The same by two critics of actions, of which the lower one counts.
-
-    critic: the network, static; params: weights of both, with an axis for them.
-    policy: whose return it is; scale: `[]` of the critics' output.
-    """
-
-    critic: ActionCritic = struct.field(pytree_node=False)
+    critic: Critic | ActionCritic = struct.field(pytree_node=False)
     params: Any
     policy: DeterministicPolicy
     scale: jax.Array
@@ -73,6 +56,8 @@ class TwinValue:
     def __call__(self, observation: jax.Array) -> jax.Array:
         """`[..., O]` observations to `[...]` values, in units of reward."""
         seen = self.policy.observations.normalize(observation)
+        if isinstance(self.critic, Critic):
+            return self.scale * cast(jax.Array, self.critic.apply(self.params, seen))
         values = twin_values(self.critic, self.params, seen, self.policy(observation))
         return self.scale * jnp.min(values, axis=0)
 
@@ -81,7 +66,7 @@ class TwinValue:
 class ResidualPolicy:
     """A controller, static, with what was learned to correct it."""
 
-    base: Controller = struct.field(pytree_node=False)
+    base: Policy = struct.field(pytree_node=False)
     correction: DeterministicPolicy
 
     def __call__(self, observation: jax.Array, key: jax.Array) -> jax.Array:

@@ -26,7 +26,7 @@ from vertiwm_jax.networks.policy import (
 from vertiwm_jax.rl import collect
 from vertiwm_jax.rl.algorithm import LearningConfig, PolicyAlgorithm
 from vertiwm_jax.rl.collect import Environments, Metrics, Outcomes, Steps
-from vertiwm_jax.rl.learned import DeterministicPolicy, TwinValue
+from vertiwm_jax.rl.learned import DeterministicPolicy, Value
 from vertiwm_jax.rl.replay import Replay
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.training import all_finite
@@ -228,10 +228,10 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         """What `state` has learned."""
         return DeterministicPolicy(self.actor(data), state.learner.averaged, state.observations)
 
-    def value(self, data: Params, state: OffPolicyState[L]) -> TwinValue:
+    def value(self, data: Params, state: OffPolicyState[L]) -> Value:
         """What `state` expects of its policy."""
         policy, scale = self.policy(data, state), state.returns.std
-        return TwinValue(self._critic, state.learner.critics, policy, scale)
+        return Value(self._critic, state.learner.critics, policy, scale)
 
     def init_weights(
         self, data: Params, observation: jax.Array, key: jax.Array

@@ -1,8 +1,8 @@
 """A trained policy in a folder of its own, apart from the training that made it."""
 
 import io
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -13,20 +13,21 @@ from flax import struct
 
 from vertiwm_jax import atomic
 from vertiwm_jax import config as configuration
-from vertiwm_jax.checkpoints import CheckpointError
+from vertiwm_jax.checkpoints import CheckpointError, named_leaves
 from vertiwm_jax.config import ConfigError, Count, Share
-from vertiwm_jax.env.action_repeat import Controller
+from vertiwm_jax.env import agent
 from vertiwm_jax.env.controllers import baselines
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.networks.policy import ActionCritic, Actor, Critic, TanhNormalActor
-from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy, TwinValue, Value
+from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy, Value
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 
 FOLDER = "policy"
 """Name of the folder in that of a run."""
 _ACTIONS = 2
+_STATISTICS = "mean", "variance", "count"
 Base = Literal["look ahead", "straight to goal", "none"]
 
 
@@ -60,10 +61,9 @@ class PolicyConfig:
     """Of the folder."""
 
     @property
-    def controller(self) -> Controller | None:
+    def controller(self) -> agent.Policy | None:
         """What it corrects."""
-        known = baselines(self.navigation, self.vehicle.vehicle)
-        return None if self.base == "none" else known[self.base]
+        return baselines(self.navigation, self.vehicle.vehicle).get(self.base)
 
     @property
     def networks(self) -> tuple[Actor | TanhNormalActor, Critic | ActionCritic]:
@@ -85,8 +85,8 @@ class Policy:
     """
 
     learned: DeterministicPolicy
-    worth: Value | TwinValue
-    base: Controller | None = struct.field(pytree_node=False)
+    worth: Value
+    base: agent.Policy | None = struct.field(pytree_node=False)
     config: PolicyConfig = struct.field(pytree_node=False)
 
     @property
@@ -113,24 +113,17 @@ class Policy:
         return self.worth(observation)
 
 
-def save(
-    folder: Path, config: PolicyConfig, policy: DeterministicPolicy, value: Value | TwinValue
-) -> None:
-    """Writes the folder of a policy; leaves have a leading axis of seeds.
+def save(folder: Path, config: PolicyConfig, value: Value) -> None:
+    """Writes the folder of a policy, the one that `value` is of; leaves have an axis of seeds.
 
     `WriteError` where that is not possible.
     """
     folder.mkdir(exist_ok=True)
-    arrays: dict[str, Any] = {
-        **_named("actor", policy.params),
-        **_named("critic", value.params),
-        "observation_mean": policy.observations.mean,
-        "observation_variance": policy.observations.variance,
-        "observation_count": policy.observations.count,
-        "return_scale": value.scale,
-    }
+    observations = value.policy.observations
+    arrays = {"actor": value.policy.params, "critic": value.params, "return_scale": value.scale}
+    arrays |= {f"observation_{name}": getattr(observations, name) for name in _STATISTICS}
     stream = io.BytesIO()
-    np.savez(stream, **jax.device_get(arrays))
+    np.savez(stream, **named_leaves(jax.device_get(arrays)))
     atomic.write(folder / "policy.yaml", configuration.dump(config))
     atomic.write(folder / "weights.npz", stream.getvalue())
 
@@ -164,45 +157,29 @@ def load_policy(folder: str | Path, seed: int = 0) -> Policy:
     except Exception as error:  # Of zip files, of what they compress and of NumPy's headers.
         raise CheckpointError(f"{file}: cannot read weights: {error}") from error
     actor, critic = config.networks
-    seen = jnp.zeros_like(arrays["observation_mean"])
-    observations = RunningStatistics(
-        *(arrays[f"observation_{name}"] for name in ("mean", "variance", "count"))
-    )
-    learned = DeterministicPolicy(
-        actor, _weights(file, "actor", arrays, actor.init, seen), observations
-    )
-    scale = arrays["return_scale"]
-    if isinstance(critic, ActionCritic):
-        twins = jax.vmap(critic.init, (0, None, None))
-
-        def init(key: jax.Array, *given: jax.Array) -> Any:
-            return twins(jax.random.split(key), *given)
-
-        params = _weights(file, "critic", arrays, init, seen, jnp.zeros(_ACTIONS))
-        worth = TwinValue(critic, params, learned, scale)
-    else:
-        worth = Value(
-            critic, _weights(file, "critic", arrays, critic.init, seen), observations, scale
-        )
-    return Policy(learned, worth, config.controller, config)
-
-
-def _named(part: str, tree: Any) -> dict[str, jax.Array]:
-    leaves = jax.tree.leaves_with_path(tree)
-    names = (jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves)
-    return {f"{part}.{name}": leaf for name, (_, leaf) in zip(names, leaves, strict=True)}
-
-
-def _weights(
-    file: Path, part: str, arrays: dict[str, jax.Array], init: Callable[..., Any], *given: jax.Array
-) -> Any:
-    """The weights of one network; `CheckpointError` where they are not those of its kind."""
-    like = jax.eval_shape(init, jax.random.key(0), *given)
-    names = _named(part, like)
+    like = jax.eval_shape(partial(_untrained, actor, critic), arrays["observation_mean"])
+    names = named_leaves(like)
     for name, leaf in names.items():
         found = arrays[name].shape if name in arrays else "none"
         if found != leaf.shape:
             raise CheckpointError(
                 f"{file}: {name}: expected shape {leaf.shape} as policy.yaml says, found {found}"
             )
-    return jax.tree.unflatten(jax.tree.structure(like), [arrays[name] for name in names])
+    weights = jax.tree.unflatten(jax.tree.structure(like), [arrays[name] for name in names])
+    observations = RunningStatistics(*(arrays[f"observation_{name}"] for name in _STATISTICS))
+    learned = DeterministicPolicy(actor, weights["actor"], observations)
+    value = Value(critic, weights["critic"], learned, arrays["return_scale"])
+    return Policy(learned, value, config.controller, config)
+
+
+def _untrained(
+    actor: Actor | TanhNormalActor, critic: Critic | ActionCritic, observation: jax.Array
+) -> dict[str, Any]:
+    """Weights of the shapes that were stored."""
+    key = jax.random.key(0)
+    if isinstance(critic, Critic):
+        critics = critic.init(key, observation)
+    else:
+        twins = jax.vmap(critic.init, (0, None, None))
+        critics = twins(jax.random.split(key), observation, jnp.zeros(_ACTIONS))
+    return {"actor": actor.init(key, observation), "critic": critics}

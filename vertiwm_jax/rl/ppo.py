@@ -210,9 +210,8 @@ class PPO(PolicyAlgorithm[TrainState]):
 
     def value(self, data: Params, state: TrainState) -> Value:
         """What `state` expects of its policy."""
-        del data  # which other algorithms need
-        params, scale = state.params["critic"], state.returns.std
-        return Value(self._critic, params, state.observations, scale)
+        policy, scale = self.policy(data, state), state.returns.std
+        return Value(self._critic, state.params["critic"], policy, scale)
 
     def _actor(self, data: Params) -> Actor:
         actions = math.prod(self.env.action_space(data).shape)
