@@ -72,9 +72,8 @@ def untrained(kind: type[TrainConfig], run: Path) -> list[DeterministicPolicy]:
         return jnp.asarray(rng.uniform(0.1, 1, leaf.shape), leaf.dtype)
 
     state = jax.tree.map(drawn, shapes)
-    value = algorithm.value(training.params, state)
+    value = algorithm.value(state)
     policy.save(run / policy.FOLDER, config.of_policy, value)
     return [
-        algorithm.policy(training.params, jax.tree.map(lambda x, i=i: x[i], state))
-        for i in range(config.loop.seeds)
+        algorithm.policy(jax.tree.map(lambda x, i=i: x[i], state)) for i in range(config.loop.seeds)
     ]

@@ -296,8 +296,8 @@ def on_a_probe(name: str) -> Numbers:
     seen = jnp.linspace(-1, 1, 5)[:, None]
     return {
         "weights": _norms(weights),
-        "actions": algorithm.policy(params, state)(seen),
-        "values": algorithm.value(params, state)(seen),
+        "actions": algorithm.policy(state)(seen),
+        "values": algorithm.value(state)(seen),
         **{f"metrics/{metric}": x for metric, x in metrics.items()},
     }
 

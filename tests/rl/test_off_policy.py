@@ -63,7 +63,7 @@ def train(algorithm, env_params=ProbeParams(), iterations=None):
 
 
 def values(algorithm, state, *observations):
-    value = algorithm.value(ProbeParams(), state)
+    value = algorithm.value(state)
     return np.asarray(value(jnp.array(observations, jnp.float32)[:, None]))
 
 
@@ -102,7 +102,7 @@ def test_policy_finds_the_action_that_depends_on_the_observation(name):
     target = algorithm(name, **TARGET)
     state, metrics = train(target)
     # Actions 0 and 2 of [-2, 4] are -1/3 and 1/3 of [-1, 1].
-    actions = target.policy(ProbeParams(), state)(jnp.array([[-1.0], [1.0]]))
+    actions = target.policy(state)(jnp.array([[-1.0], [1.0]]))
     np.testing.assert_allclose(actions[:, 0], [-1 / 3, 1 / 3], atol=0.1)
     if name == "sac":  # the temperature keeps the entropy asked for
         assert abs(float(metrics["entropy"]) + 2) < 0.5
@@ -117,7 +117,7 @@ def test_a_penalty_keeps_actions_small_unless_more_are_worth_it(name):
         jnp.array([[-1.0], [1.0]]),
     )
     state, _ = train(target)
-    np.testing.assert_allclose(target.policy(ProbeParams(), state)(observations), 0.0, atol=0.05)
+    np.testing.assert_allclose(target.policy(state)(observations), 0.0, atol=0.05)
 
 
 @each
@@ -145,7 +145,7 @@ def test_an_average_of_the_actor_drives(name):
     first = compiled(target)[0](ProbeParams(), jax.random.key(0)).learner.actor
     state, _ = train(target, iterations=2)  # one gradient step: see above
     average = jax.tree.map(lambda x, y: 0.75 * x + 0.25 * y, first, state.learner.actor)
-    chex.assert_trees_all_close(target.policy(ProbeParams(), state).params, average, atol=1e-7)
+    chex.assert_trees_all_close(target.policy(state).params, average, atol=1e-7)
     with pytest.raises(AssertionError):
         chex.assert_trees_all_close(state.learner.actor, average, atol=1e-7)
 

@@ -53,9 +53,7 @@ def train(ppo, env_params=ProbeParams(), seed=0, iterations=None):
 
 
 def values(ppo, state, *observations):
-    return np.asarray(
-        ppo.value(ProbeParams(), state)(jnp.array(observations, jnp.float32)[:, None])
-    )
+    return np.asarray(ppo.value(state)(jnp.array(observations, jnp.float32)[:, None]))
 
 
 @pytest.mark.parametrize("normalise", [False, True])
@@ -91,7 +89,7 @@ def test_policy_finds_the_action_that_depends_on_the_observation(normalise):
     ppo = PPO(Target(), PPOConfig(**{**vars(TARGET.config), **config}))
     state, _ = train(ppo)
     # Actions 0 and 2 of [-2, 4] are -1/3 and 1/3 of [-1, 1].
-    actions = ppo.policy(ProbeParams(), state)(jnp.array([[-1.0], [1.0]]))
+    actions = ppo.policy(state)(jnp.array([[-1.0], [1.0]]))
     np.testing.assert_allclose(actions[:, 0], [-1 / 3, 1 / 3], atol=0.05)
 
 
@@ -182,7 +180,7 @@ def test_what_is_learned_from_is_what_was_seen():
     state, metrics = train(ppo, iterations=20)
     # Ratios of probabilities are 1 if the networks are told of each transition what they had seen.
     assert abs(metrics["kl"]) < 1e-6
-    actions = ppo.policy(ProbeParams(), state)(Pictured.pictured(jnp.array([[-1.0], [1.0]])))
+    actions = ppo.policy(state)(Pictured.pictured(jnp.array([[-1.0], [1.0]])))
     assert np.ptp(actions) > 0.1
 
 
@@ -199,7 +197,7 @@ def test_what_has_learned_nothing_leaves_a_controller_as_it_is():
     weights = state.params["actor"]["params"]
     still = {**weights, "MLP_0": jax.tree.map(jnp.zeros_like, weights["MLP_0"])}
     state = state.replace(params={**state.params, "actor": {"params": still}})
-    learned = ppo.policy(ProbeParams(), state)
+    learned = ppo.policy(state)
     np.testing.assert_array_equal(learned(observations), jnp.zeros((3, 1)))
     corrected = ResidualPolicy(lambda observation, key: observation / 3, learned)
     action = corrected(observations, jax.random.key(1))

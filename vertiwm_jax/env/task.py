@@ -1,7 +1,6 @@
 """What goal navigation asks, where an episode of it stands, and what all of them are run with."""
 
 import dataclasses
-from typing import ClassVar
 
 import jax
 import numpy as np
@@ -39,11 +38,6 @@ class NavigationConfig:
     route: how the way to the goal is found; it is straight where the map is not all known.
     sensing: what sensors see of a map that is unknown at first; by default all of it is known.
     """
-
-    GONE: ClassVar[dict[str, str]] = {
-        "chassis": "is gone; the sizes are those of the vehicle, see `vehicle`",
-        "reveal": "is now sensing",
-    }
 
     goal_radius: float = 8.0
     horizon_seconds: float = 60.0

@@ -2,16 +2,29 @@
 
 import math
 from abc import abstractmethod
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, TypeVar
 
+import jax
+import jax.numpy as jnp
 import optax
+from flax import struct
+from gymnax.environments.environment import Environment
 
 from vertiwm_jax.config import Count, Positive, Share, settings
 from vertiwm_jax.env.action_repeat import ActionRepeat
+from vertiwm_jax.networks.policy import (
+    ActionCritic,
+    Actor,
+    Critic,
+    ObservationLayout,
+    TanhNormalActor,
+)
+from vertiwm_jax.rl import collect
+from vertiwm_jax.rl.collect import Environments, Outcomes, Steps
 from vertiwm_jax.rl.learned import DeterministicPolicy, Value
+from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.training import Algorithm
-
-State = TypeVar("State")
 
 
 @settings
@@ -19,8 +32,6 @@ class LearningConfig:
     """How much is experienced, and what networks learn from it."""
 
     GONE: ClassVar[dict[str, str]] = {
-        "normalise_observations": "is now normalize_observations",
-        "normalise_rewards": "is now normalize_rewards",
         "transitions": "is now total_timesteps, action_repeat times as many",
     }
 
@@ -50,14 +61,41 @@ class LearningConfig:
         return optax.flatten(optax.chain(clip, optax.adam(rate, eps=eps)))
 
 
-class PolicyAlgorithm(Algorithm[State]):
-    """An algorithm that learns a policy from environments; `data` are their parameters.
+@struct.dataclass
+class LearningState:
+    """What training carries from one iteration to the next, whatever the algorithm.
 
-    env: a gymnax environment; config: a `LearningConfig`.
+    iteration: `[]` int32, iterations done. key: `[]` random key.
+    observations: statistics of observations, `[O]`; those of no sample if they are used raw.
+    returns: statistics of discounted returns, `[]`; likewise.
+    environments: where the environments stand.
     """
 
-    env: Any
+    iteration: jax.Array
+    key: jax.Array
+    observations: RunningStatistics
+    returns: RunningStatistics
+    environments: Environments
+
+
+S = TypeVar("S", bound=LearningState)
+
+
+@dataclass(frozen=True)
+class PolicyAlgorithm(Algorithm[S]):
+    """An algorithm that learns a policy from the episodes of an environment.
+
+    env: a gymnax environment with a flat observation and a bounded Box of actions, static; its
+        parameters are the `data` of every function.
+    config: a `LearningConfig`.
+    outcomes: what to report, averaged over the episodes that end in an iteration.
+    layout: how the networks read observations.
+    """
+
+    env: Environment
     config: Any
+    outcomes: Outcomes = lambda info: {}
+    layout: ObservationLayout = ObservationLayout()
 
     @property
     def batch(self) -> int:
@@ -74,10 +112,49 @@ class PolicyAlgorithm(Algorithm[State]):
         """Iterations of the whole training."""
         return math.ceil(self.config.total_timesteps / self.timesteps)
 
+    @property
+    def actions(self) -> int:
+        """A, how many numbers an action has."""
+        return math.prod(self.env.action_space(None).shape)
+
+    @property
     @abstractmethod
-    def policy(self, data: Any, state: State) -> DeterministicPolicy:
-        """What `state` has learned."""
+    def actor(self) -> Actor | TanhNormalActor:
+        """The network of the policy."""
+
+    @property
+    @abstractmethod
+    def critic(self) -> Critic | ActionCritic:
+        """The network of values."""
 
     @abstractmethod
-    def value(self, data: Any, state: State) -> Value:
+    def weights(self, state: S) -> tuple[Any, Any]:
+        """Of the actor that drives in the end, and of the critic."""
+
+    def policy(self, state: S) -> DeterministicPolicy:
+        """What `state` has learned."""
+        return DeterministicPolicy(self.actor, self.weights(state)[0], state.observations)
+
+    def value(self, state: S) -> Value:
         """What `state` expects of its policy."""
+        return Value(self.critic, self.weights(state)[1], self.policy(state), state.returns.std)
+
+    def start(self, data: Any, reset_key: jax.Array, key: jax.Array) -> dict[str, Any]:
+        """The fields of a `LearningState` before the first iteration, which has `key`."""
+        running = collect.start(self.env, data, self.config.num_envs, reset_key)
+        return {
+            "iteration": jnp.int32(0),
+            "key": key,
+            "observations": RunningStatistics.create(running.observation.shape[1:]),
+            "returns": RunningStatistics.create(()),
+            "environments": running,
+        }
+
+    def with_statistics(self, state: S, steps: Steps) -> S:
+        """The state with these steps in the statistics that are in use."""
+        returns, observations = state.returns, state.observations
+        if self.config.normalize_rewards:
+            returns = returns.update(steps.discounted_return)
+        if self.config.normalize_observations:
+            observations = observations.update(steps.observation)
+        return replace(state, returns=returns, observations=observations)

@@ -346,7 +346,7 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
         _log.info("training in %s on %d worlds%s", config.model, terrain.worlds, products)
 
         def keep(state: Any) -> None:
-            value = algorithm.value(params, state)
+            value = algorithm.value(state)
             policy.save(begun.folder / policy.FOLDER, config.of_policy, value)
 
         steps = algorithm.timesteps * config.loop.seeds

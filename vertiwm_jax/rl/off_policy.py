@@ -6,29 +6,22 @@ batches from it.
 
 import math
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from gymnax.environments.environment import Environment
 
 from vertiwm_jax import parallel
 from vertiwm_jax.config import ConfigError, Count, NotNegative, Positive, Share, settings
-from vertiwm_jax.networks.policy import (
-    ActionCritic,
-    ObservationLayout,
-    TanhNormalActor,
-    twin_values,
-)
+from vertiwm_jax.networks.policy import ActionCritic, TanhNormal, TanhNormalActor, twin_values
 from vertiwm_jax.rl import collect
-from vertiwm_jax.rl.algorithm import LearningConfig, PolicyAlgorithm
-from vertiwm_jax.rl.collect import Environments, Metrics, Outcomes, Steps
-from vertiwm_jax.rl.learned import DeterministicPolicy, Value
+from vertiwm_jax.rl.algorithm import LearningConfig, LearningState, PolicyAlgorithm
+from vertiwm_jax.rl.collect import Metrics, Steps
 from vertiwm_jax.rl.replay import Replay
-from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.training import all_finite
 
 Params = Any
@@ -37,13 +30,6 @@ Params = Any
 @settings
 class OffPolicyConfig(LearningConfig):
     """Settings of an algorithm with a replay buffer; its learning rate is constant."""
-
-    GONE: ClassVar[dict[str, str]] = LearningConfig.GONE | {
-        "capacity": "is now buffer_size",
-        "warm_up": "is now learning_starts",
-        "target_rate": "is now tau",
-        "restraint": "is now action_penalty",
-    }
 
     num_envs: Count = 128
     """Environments run side by side."""
@@ -116,84 +102,67 @@ L = TypeVar("L", bound=Learner)
 
 
 @struct.dataclass
-class OffPolicyState(Generic[L]):
+class OffPolicyState(LearningState, Generic[L]):
     """All that training carries from one iteration to the next.
 
-    iteration: `[]` int32, iterations done. key: `[]` random key.
-    learner: what was learned. replay: of `Remembered`.
-    observations, returns: statistics, as `ppo.TrainState` has them.
-    environments: where the environments stand.
+    learner: what was learned; replay: of `Remembered`.
     """
 
-    iteration: jax.Array
-    key: jax.Array
     learner: L
     replay: Replay
-    observations: RunningStatistics
-    returns: RunningStatistics
-    environments: Environments
 
 
 @dataclass(frozen=True)
 class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
-    """Learns on a gymnax environment with a flat observation and a bounded Box of actions.
+    """Learns from replayed steps; an algorithm says how it explores and learns from a batch."""
 
-    An algorithm says how it explores and what it learns from a batch.
-
-    env: static; its parameters, `data`, are an argument of every function.
-    outcomes: what to report, averaged over the episodes that end in an iteration.
-    layout: how the networks read observations.
-    """
-
-    env: Environment
     config: OffPolicyConfig
-    outcomes: Outcomes = lambda info: {}
-    layout: ObservationLayout = ObservationLayout()
 
     @property
     def batch(self) -> int:
         return math.gcd(self.config.num_envs, self.config.batch)
 
-    @abstractmethod
-    def actor(self, data: Params) -> TanhNormalActor:
-        """The network of the policy."""
+    @property
+    def actor(self) -> TanhNormalActor:
+        config = self.config
+        log_std = getattr(config, "initial_log_std", None)
+        return TanhNormalActor(self.actions, config.hidden, log_std, self.layout)
+
+    @property
+    def critic(self) -> ActionCritic:
+        return ActionCritic(self.config.hidden, self.layout)
+
+    def weights(self, state: OffPolicyState[L]) -> tuple[Params, Params]:
+        return state.learner.averaged, state.learner.critics
 
     @abstractmethod
-    def init_learner(self, data: Params, observation: jax.Array, key: jax.Array) -> L:
+    def init_learner(self, observation: jax.Array, key: jax.Array) -> L:
         """The learner before the first batch; `observation` `[O]`."""
 
     @abstractmethod
-    def explore(
-        self, data: Params, learner: L, observation: jax.Array, key: jax.Array
-    ) -> jax.Array:
+    def explore(self, learner: L, observation: jax.Array, key: jax.Array) -> jax.Array:
         """`[N, O]` normalized observations to `[N, A]` actions in [-1, 1]."""
 
     @abstractmethod
-    def learn(
-        self, data: Params, learner: L, batch: Remembered, key: jax.Array
-    ) -> tuple[L, Metrics]:
+    def learn(self, learner: L, batch: Remembered, key: jax.Array) -> tuple[L, Metrics]:
         """A gradient step on a normalized batch; the metrics are scalars, NaN for none."""
 
     def init(self, data: Params, key: jax.Array) -> OffPolicyState[L]:
         """The state before the first iteration."""
         key, reset_key, learner_key = jax.random.split(key, 3)
-        running = collect.start(self.env, data, self.config.num_envs, reset_key)
-        observation = running.observation[0]
+        begun = self.start(data, reset_key, key)
+        observation = begun["environments"].observation[0]
         row = Remembered(
             observation=observation,
             following=observation,
-            action=jnp.zeros(self._actions(data)),
+            action=jnp.zeros(self.actions),
             reward=jnp.float32(0),
             terminated=jnp.array(False),
         )
         return OffPolicyState(
-            iteration=jnp.int32(0),
-            key=key,
-            learner=self.init_learner(data, observation, learner_key),
+            **begun,
+            learner=self.init_learner(observation, learner_key),
             replay=Replay.create(row, self.config.buffer_size),
-            observations=RunningStatistics.create(observation.shape),
-            returns=RunningStatistics.create(()),
-            environments=running,
         )
 
     def iterate(self, data: Params, state: OffPolicyState[L]) -> tuple[OffPolicyState[L], Metrics]:
@@ -212,7 +181,7 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
             with jax.named_scope("collect"):
                 state, steps = self._collect(data, state, collect_key)
             with jax.named_scope("update"):
-                state, losses = self._learn(data, state, learn_key)
+                state, losses = self._learn(state, learn_key)
             return state, (steps, losses)
 
         state, (steps, losses) = jax.lax.scan(advance, state, keys)
@@ -224,26 +193,15 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         }
         return replace(state, iteration=state.iteration + 1, key=key), metrics
 
-    def policy(self, data: Params, state: OffPolicyState[L]) -> DeterministicPolicy:
-        """What `state` has learned."""
-        return DeterministicPolicy(self.actor(data), state.learner.averaged, state.observations)
-
-    def value(self, data: Params, state: OffPolicyState[L]) -> Value:
-        """What `state` expects of its policy."""
-        policy, scale = self.policy(data, state), state.returns.std
-        return Value(self._critic, state.learner.critics, policy, scale)
-
-    def init_weights(
-        self, data: Params, observation: jax.Array, key: jax.Array
-    ) -> dict[str, Params]:
+    def init_weights(self, observation: jax.Array, key: jax.Array) -> dict[str, Params]:
         """The fields of a `Learner`; targets are copies of their own, for states are donated."""
         actor_key, critic_key = jax.random.split(key)
-        action = jnp.zeros(self._actions(data))
+        action = jnp.zeros(self.actions)
         # One after the other, as `training.Seeds` does with seeds.
         critics = jax.lax.map(
-            lambda key: self._critic.init(key, observation, action), jax.random.split(critic_key)
+            lambda key: self.critic.init(key, observation, action), jax.random.split(critic_key)
         )
-        actor = self.actor(data).init(actor_key, observation)
+        actor = self.actor.init(actor_key, observation)
         return {
             "actor": actor,
             "averaged": jax.tree.map(jnp.array, actor),
@@ -253,9 +211,13 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
             "critic_optimizer": self.optimizer.init(critics),
         }
 
+    def distribution(self, actor: Params, observation: jax.Array) -> TanhNormal:
+        """The policy at normalized observations `[..., O]`."""
+        return cast(TanhNormal, self.actor.apply(actor, observation))
+
     def twins(self, critics: Params, observation: jax.Array, action: jax.Array) -> jax.Array:
         """`[2, ...]` values of actions, as both critics have them."""
-        return twin_values(self._critic, critics, observation, action)
+        return twin_values(self.critic, critics, observation, action)
 
     def fit_critics(self, learner: L, batch: Remembered, later: jax.Array) -> tuple[L, jax.Array]:
         """A gradient step of both critics; also the loss.
@@ -272,6 +234,25 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         critics, optimizer = self.descend(gradient, learner.critic_optimizer, learner.critics)
         return replace(learner, critics=critics, critic_optimizer=optimizer), value
 
+    def fit_actor(
+        self, learner: L, loss: Callable[[Params], tuple[jax.Array, Any]]
+    ) -> tuple[L, jax.Array, Any]:
+        """A gradient step of the actor, after which its average and the targets follow.
+
+        loss: of the actor's weights, with anything beside it; both are given back.
+        """
+        (value, beside), gradient = jax.value_and_grad(loss, has_aux=True)(learner.actor)
+        actor, optimizer = self.descend(gradient, learner.actor_optimizer, learner.actor)
+        tau = self.config.tau
+        learner = replace(
+            learner,
+            actor=actor,
+            averaged=optax.incremental_update(actor, learner.averaged, tau),
+            target=optax.incremental_update(learner.critics, learner.target, tau),
+            actor_optimizer=optimizer,
+        )
+        return learner, value, beside
+
     def penalty(self, action: jax.Array, value: jax.Array) -> jax.Array:
         """What `[B, A]` actions cost an actor beside their values `[B]`: see `action_penalty`."""
         size = jax.lax.stop_gradient(jnp.mean(jnp.abs(value)))
@@ -287,13 +268,6 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         """Of actor and critics."""
         return self.config.adam(self.config.learning_rate, eps=1e-8)
 
-    @property
-    def _critic(self) -> ActionCritic:
-        return ActionCritic(self.config.hidden, self.layout)
-
-    def _actions(self, data: Params) -> int:
-        return math.prod(self.env.action_space(data).shape)
-
     def _exploring(self, state: OffPolicyState[L]) -> jax.Array:
         """Whether actions are still random, and nothing is learned."""
         return state.replay.filled < self.config.learning_starts
@@ -305,7 +279,7 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         explore_key, random_key, step_key = jax.random.split(key, 3)
         running, config = state.environments, self.config
         seen = state.observations.normalize(running.observation)
-        chosen = self.explore(data, state.learner, seen, explore_key)
+        chosen = self.explore(state.learner, seen, explore_key)
         anything = jax.random.uniform(random_key, chosen.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(self._exploring(state), anything, chosen)
         keys = jax.random.split(step_key, config.num_envs)
@@ -319,22 +293,11 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
             reward=steps.reward,
             terminated=steps.terminated,
         )
-        returns, observations = state.returns, state.observations
-        if config.normalize_rewards:
-            returns = returns.update(steps.discounted_return)
-        if config.normalize_observations:
-            observations = observations.update(steps.observation)
-        return replace(
-            state,
-            replay=state.replay.add(parallel.whole(rows)),
-            returns=returns,
-            observations=observations,
-            environments=running,
-        ), steps
+        state = self.with_statistics(state, steps)
+        replay = state.replay.add(parallel.whole(rows))
+        return replace(state, replay=replay, environments=running), steps
 
-    def _learn(
-        self, data: Params, state: OffPolicyState[L], key: jax.Array
-    ) -> tuple[OffPolicyState[L], Metrics]:
+    def _learn(self, state: OffPolicyState[L], key: jax.Array) -> tuple[OffPolicyState[L], Metrics]:
         """`updates` gradient steps, none while exploring; the metrics are means."""
 
         def update(learner: L, key: jax.Array) -> tuple[L, Metrics]:
@@ -346,7 +309,7 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
                 following=state.observations.normalize(batch.following),
                 reward=batch.reward / state.returns.std,
             )
-            return self.learn(data, learner, batch, learn_key)
+            return self.learn(learner, batch, learn_key)
 
         def updates(learner: L) -> tuple[L, Metrics]:
             keys = jax.random.split(key, self.config.updates)

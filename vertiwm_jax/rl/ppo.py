@@ -1,4 +1,4 @@
-"""Proximal policy optimisation, collection and update in one compiled program.
+"""Proximal policy optimization, collection and update in one compiled program.
 
 Schulman et al. (2017), with the details of Andrychowicz et al. (2021). It is written for one
 device. Where a mesh is in context, each device does this with its share of the environments, and
@@ -14,19 +14,16 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from gymnax.environments.environment import Environment
 from jax.sharding import PartitionSpec
 
 from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, NotNegative, Positive, Share, settings
-from vertiwm_jax.networks.policy import Actor, Critic, Gaussian, ObservationLayout
+from vertiwm_jax.networks.policy import Actor, Critic, Gaussian
 from vertiwm_jax.parallel import BATCH, ROWS, WHOLE
 from vertiwm_jax.rl import collect
-from vertiwm_jax.rl.algorithm import LearningConfig, PolicyAlgorithm
-from vertiwm_jax.rl.collect import Environments, Metrics, Outcomes, Steps
+from vertiwm_jax.rl.algorithm import LearningConfig, LearningState, PolicyAlgorithm
+from vertiwm_jax.rl.collect import Environments, Metrics, Steps
 from vertiwm_jax.rl.gae import gae
-from vertiwm_jax.rl.learned import DeterministicPolicy, Value
-from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.training import all_finite, mean_in_turns
 
 Params = Any
@@ -37,14 +34,6 @@ _BY_ENVIRONMENT = PartitionSpec(None, BATCH)
 @settings
 class PPOConfig(LearningConfig):
     """Settings of PPO."""
-
-    GONE: ClassVar[dict[str, str]] = LearningConfig.GONE | {
-        "accumulate": "is now grad_accumulation",
-        "trace": "is now gae_lambda",
-        "clip": "is now clip_eps",
-        "value_weight": "is now vf_coef",
-        "entropy_weight": "is now ent_coef",
-    }
 
     initial_log_std: float = -0.9
     """Log standard deviation of the first policy, in units of half the action range."""
@@ -78,38 +67,22 @@ class PPOConfig(LearningConfig):
 
 
 @struct.dataclass
-class TrainState:
+class TrainState(LearningState):
     """All that training carries from one iteration to the next.
 
-    iteration: `[]` int32, iterations done.
-    key: `[]` random key.
-    params: the networks' weights, `{"actor": ..., "critic": ...}`.
-    optimizer: the state of Adam.
-    observations: statistics of observations, `[O]`; those of no sample if they are used raw.
-    returns: statistics of discounted returns, `[]`; likewise.
-    environments: where the environments stand.
+    params: the networks' weights, `{"actor": ..., "critic": ...}`; optimizer: the state of Adam.
     """
 
-    iteration: jax.Array
-    key: jax.Array
     params: Params
     optimizer: optax.OptState
-    observations: RunningStatistics
-    returns: RunningStatistics
-    environments: Environments
 
 
-@struct.dataclass
-class Draws:
-    """All that is random in an iteration, drawn for all N environments on any number of devices.
+Draws = tuple[jax.Array, jax.Array, jax.Array]
+"""All that is random in an iteration, drawn for all N environments on any number of devices.
 
-    noise: `[T, N, A]` of actions; keys: `[T, N]` of environments; order: `[E, N, T]` in which steps
-        of each environment are learned from, in each epoch.
-    """
-
-    noise: jax.Array
-    keys: jax.Array
-    order: jax.Array
+Noise `[T, N, A]` of actions, keys `[T, N]` of environments, and the order `[E, N, T]` in which
+steps of each environment are learned from, in each epoch.
+"""
 
 
 @struct.dataclass
@@ -141,24 +114,13 @@ class Batch:
     target: jax.Array
 
 
-_STATE: Any = TrainState(WHOLE, WHOLE, WHOLE, WHOLE, WHOLE, WHOLE, ROWS)  # pyright: ignore
-
-
 @dataclass(frozen=True)
 class PPO(PolicyAlgorithm[TrainState]):
-    """PPO on a gymnax environment with a flat observation and a bounded Box of actions.
+    """PPO, see `PolicyAlgorithm`."""
 
-    env: static; its parameters are an argument of every function.
-    outcomes: what to report, averaged over the episodes that end in an iteration.
-    layout: how the networks read observations.
-    """
+    specs: ClassVar[Any] = TrainState(WHOLE, WHOLE, WHOLE, WHOLE, ROWS, WHOLE, WHOLE)  # pyright: ignore
 
-    specs: ClassVar[Any] = _STATE
-
-    env: Environment
     config: PPOConfig
-    outcomes: Outcomes = lambda info: {}
-    layout: ObservationLayout = ObservationLayout()
 
     @property
     def learning_rate_schedule(self) -> optax.Schedule:
@@ -171,24 +133,28 @@ class PPO(PolicyAlgorithm[TrainState]):
             "cosine": optax.cosine_decay_schedule(rate, steps),
         }[self.config.schedule]
 
+    @property
+    def actor(self) -> Actor:
+        config = self.config
+        return Actor(self.actions, config.hidden, config.initial_log_std, self.layout)
+
+    @property
+    def critic(self) -> Critic:
+        return Critic(self.config.hidden, self.layout)
+
+    def weights(self, state: TrainState) -> tuple[Params, Params]:
+        return state.params["actor"], state.params["critic"]
+
     def init(self, data: Params, key: jax.Array) -> TrainState:
         """The state before the first iteration."""
         key, reset_key, actor_key, critic_key = jax.random.split(key, 4)
-        running = collect.start(self.env, data, self.config.num_envs, reset_key)
-        observation = running.observation
+        begun = self.start(data, reset_key, key)
+        observation = begun["environments"].observation[0]
         params = {
-            "actor": self._actor(data).init(actor_key, observation[0]),
-            "critic": self._critic.init(critic_key, observation[0]),
+            "actor": self.actor.init(actor_key, observation),
+            "critic": self.critic.init(critic_key, observation),
         }
-        return TrainState(
-            iteration=jnp.zeros((), jnp.int32),
-            key=key,
-            params=params,
-            optimizer=self._optimizer.init(params),
-            observations=RunningStatistics.create(observation.shape[1:]),
-            returns=RunningStatistics.create(()),
-            environments=running,
-        )
+        return TrainState(**begun, params=params, optimizer=self._optimizer.init(params))
 
     def iterate(self, data: Params, state: TrainState) -> tuple[TrainState, Metrics]:
         """Collects `[T, N]` steps and learns from them; jit it with `state` donated.
@@ -197,74 +163,43 @@ class PPO(PolicyAlgorithm[TrainState]):
         this iteration, NaN if there were none; `finite` says whether all weights still are.
         """
         key, collect_key, update_key = jax.random.split(state.key, 3)
-        draws = self._draws(data, collect_key, update_key)
+        draws = self._draws(collect_key, update_key)
         on_device = parallel.shard(
             self._iterate, (WHOLE, self.specs, _BY_ENVIRONMENT), (self.specs, WHOLE)
         )
         return on_device(data, replace(state, key=key), draws)
-
-    def policy(self, data: Params, state: TrainState) -> DeterministicPolicy:
-        """What `state` has learned."""
-        actor, params = self._actor(data), state.params["actor"]
-        return DeterministicPolicy(actor, params, state.observations)
-
-    def value(self, data: Params, state: TrainState) -> Value:
-        """What `state` expects of its policy."""
-        policy, scale = self.policy(data, state), state.returns.std
-        return Value(self._critic, state.params["critic"], policy, scale)
-
-    def _actor(self, data: Params) -> Actor:
-        actions = math.prod(self.env.action_space(data).shape)
-        config = self.config
-        return Actor(actions, config.hidden, config.initial_log_std, self.layout)
-
-    @property
-    def _critic(self) -> Critic:
-        return Critic(self.config.hidden, self.layout)
 
     @property
     def _optimizer(self) -> optax.GradientTransformation:
         return self.config.adam(self.learning_rate_schedule, eps=1e-5)
 
     def _value(self, params: Params, observation: jax.Array) -> jax.Array:
-        return cast(jax.Array, self._critic.apply(params["critic"], observation))
+        return cast(jax.Array, self.critic.apply(params["critic"], observation))
 
-    def _draws(self, data: Params, collect_key: jax.Array, update_key: jax.Array) -> Draws:
-        config, actions = self.config, self.env.action_space(data).shape
-        environments, epochs = config.num_envs, config.epochs
+    def _draws(self, collect_key: jax.Array, update_key: jax.Array) -> Draws:
+        config, environments = self.config, self.config.num_envs
         step_keys = jax.vmap(jax.random.split)(jax.random.split(collect_key, config.num_steps))
-        order_keys = jax.random.split(update_key, epochs * environments)
-        permutation = partial(jax.random.permutation, x=config.num_steps)
-        order = jax.vmap(permutation)(order_keys)
-        return Draws(
-            noise=jax.vmap(lambda key: jax.random.normal(key, (environments, *actions)))(
-                step_keys[:, 0]
-            ),
-            keys=jax.vmap(lambda key: jax.random.split(key, environments))(step_keys[:, 1]),
-            order=order.reshape(epochs, environments, -1),
+        noise = partial(jax.random.normal, shape=(environments, self.actions))
+        order_keys = jax.random.split(update_key, config.epochs * environments)
+        order = jax.vmap(partial(jax.random.permutation, x=config.num_steps))(order_keys)
+        return (
+            jax.vmap(noise)(step_keys[:, 0]),
+            jax.vmap(lambda key: jax.random.split(key, environments))(step_keys[:, 1]),
+            order.reshape(config.epochs, environments, -1),
         )
 
     def _iterate(self, data: Params, state: TrainState, draws: Draws) -> tuple[TrainState, Metrics]:
         """An iteration of one device with N environments of its own."""
-        config, observations, returns = self.config, state.observations, state.returns
+        config, (noise, keys, order) = self.config, draws
         with jax.named_scope("collect"):
-            running, rollout = self._collect(data, state, draws)
+            running, rollout = self._collect(data, state, noise, keys)
         with jax.named_scope("advantages"):
-            steps = rollout.steps
-            if config.normalize_rewards:
-                returns = returns.update(steps.discounted_return)
-            if config.normalize_observations:
-                # From the next iteration on: within one, all are normalized alike.
-                observations = observations.update(steps.observation)
-            advantage = gae(
-                steps.reward / returns.std,
-                rollout.value,
-                rollout.next_value,
-                steps.terminated,
-                steps.truncated,
-                config.discount,
-                config.gae_lambda,
-            )
+            steps, values = rollout.steps, (rollout.value, rollout.next_value)
+            # Observations from the next iteration on: within one, all are normalized alike.
+            following = self.with_statistics(state, steps)
+            ends = steps.terminated, steps.truncated
+            rewards = steps.reward / following.returns.std
+            advantage = gae(rewards, *values, *ends, config.discount, config.gae_lambda)
             batch = Batch(
                 observation=steps.observation,
                 action=steps.action,
@@ -274,7 +209,7 @@ class PPO(PolicyAlgorithm[TrainState]):
                 target=advantage + rollout.value,
             )
         with jax.named_scope("update"):
-            params, optimizer, losses = self._update(data, state, batch, draws.order)
+            params, optimizer, losses = self._update(state, batch, order)
         (_, unexplained), (_, variance) = map(
             parallel.moments, (batch.target - batch.value, batch.target)
         )
@@ -285,22 +220,14 @@ class PPO(PolicyAlgorithm[TrainState]):
             "explained_variance": 1 - unexplained / variance,
             "finite": all_finite((params, losses)),
         }
-        state = replace(
-            state,
-            iteration=state.iteration + 1,
-            params=params,
-            optimizer=optimizer,
-            observations=observations,
-            returns=returns,
-            environments=running,
-        )
-        return state, metrics
+        learned = {"params": params, "optimizer": optimizer, "environments": running}
+        return replace(following, iteration=state.iteration + 1, **learned), metrics
 
     def _collect(
-        self, data: Params, state: TrainState, draws: Draws
+        self, data: Params, state: TrainState, noise: jax.Array, keys: jax.Array
     ) -> tuple[Environments, Rollout]:
         """T steps of N environments with the policy as it is."""
-        actor, discount = self._actor(data), self.config.discount
+        actor, discount = self.actor, self.config.discount
 
         def value_of(observation: jax.Array) -> jax.Array:
             return self._value(state.params, state.observations.normalize(observation))
@@ -322,13 +249,13 @@ class PPO(PolicyAlgorithm[TrainState]):
             value = self._value(state.params, seen)
             return running, Rollout(steps, policy.log_prob(action), value, next_value)
 
-        running, rollout = jax.lax.scan(advance, state.environments, (draws.noise, draws.keys))
+        running, rollout = jax.lax.scan(advance, state.environments, (noise, keys))
         following = jnp.concatenate([rollout.value[1:], value_of(running.observation)[None]])
         next_value = jnp.where(rollout.steps.done, rollout.next_value, following)
         return running, replace(rollout, next_value=next_value)
 
     def _update(
-        self, data: Params, state: TrainState, batch: Batch, order: jax.Array
+        self, state: TrainState, batch: Batch, order: jax.Array
     ) -> tuple[Params, optax.OptState, Metrics]:
         """`epochs` passes of `minibatches` gradient steps; the losses are means over all.
 
@@ -348,11 +275,15 @@ class PPO(PolicyAlgorithm[TrainState]):
 
             def of_part(rows: jax.Array) -> tuple[Params, Metrics]:
                 part = jax.tree.map(lambda leaf: take(leaf, rows), batch)
+                # Not before, and each part by itself, so that observations are normalized while
+                # they are copied: copies of them take long to write.
+                seen = [
+                    state.observations.of(part).normalize(take(batch.observation, rows, part))
+                    for part in self.layout.parts
+                ]
                 advantage = (part.advantage - mean) / (deviation + 1e-8)
-                part = replace(
-                    part, observation=self._seen(state, batch, rows), advantage=advantage
-                )
-                return jax.grad(self._loss, has_aux=True)(params, data, part)
+                part = replace(part, observation=jnp.concatenate(seen, -1), advantage=advantage)
+                return jax.grad(self._loss, has_aux=True)(params, part)
 
             gradients, losses = parallel.mean(mean_in_turns(of_part, rows))
             updates, optimizer_state = optimizer.update(gradients, optimizer_state, params)
@@ -363,19 +294,9 @@ class PPO(PolicyAlgorithm[TrainState]):
         )
         return params, optimizer_state, jax.tree.map(jnp.mean, losses)
 
-    def _seen(self, state: TrainState, batch: Batch, rows: jax.Array) -> jax.Array:
-        """Observations of these rows, normalized."""
-        # Not before, and each part by itself, so that it is normalized while it is copied: copies
-        # of observations take long to write.
-        parts = [
-            state.observations.of(part).normalize(take(batch.observation, rows, part))
-            for part in self.layout.parts
-        ]
-        return jnp.concatenate(parts, axis=-1)
-
-    def _loss(self, params: Params, data: Params, batch: Batch) -> tuple[jax.Array, Metrics]:
+    def _loss(self, params: Params, batch: Batch) -> tuple[jax.Array, Metrics]:
         config = self.config
-        policy = cast(Gaussian, self._actor(data).apply(params["actor"], batch.observation))
+        policy = cast(Gaussian, self.actor.apply(params["actor"], batch.observation))
         log_ratio = policy.log_prob(batch.action) - batch.log_prob
         ratio = jnp.exp(log_ratio)
         clipped = jnp.clip(ratio, 1 - config.clip_eps, 1 + config.clip_eps)

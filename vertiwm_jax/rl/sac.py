@@ -5,15 +5,13 @@ temperature that keeps the policy's entropy.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 
 from vertiwm_jax.config import Positive, settings
-from vertiwm_jax.networks.policy import TanhNormal, TanhNormalActor
 from vertiwm_jax.rl.collect import Metrics
 from vertiwm_jax.rl.off_policy import Learner, OffPolicy, OffPolicyConfig, Params, Remembered
 
@@ -44,59 +42,38 @@ class SAC(OffPolicy[SACLearner]):
 
     config: SACConfig
 
-    def actor(self, data: Params) -> TanhNormalActor:
-        config = self.config
-        return TanhNormalActor(
-            self._actions(data), config.hidden, config.initial_log_std, self.layout
-        )
-
-    def init_learner(self, data: Params, observation: jax.Array, key: jax.Array) -> SACLearner:
+    def init_learner(self, observation: jax.Array, key: jax.Array) -> SACLearner:
         log_temperature = jnp.log(jnp.float32(self.config.initial_temperature))
         return SACLearner(
-            **self.init_weights(data, observation, key),
+            **self.init_weights(observation, key),
             log_temperature=log_temperature,
             temperature_optimizer=self.optimizer.init(log_temperature),
         )
 
-    def explore(
-        self, data: Params, learner: SACLearner, observation: jax.Array, key: jax.Array
-    ) -> jax.Array:
-        return self._policy(data, learner.actor, observation).sample(key)[0]
+    def explore(self, learner: SACLearner, observation: jax.Array, key: jax.Array) -> jax.Array:
+        return self.distribution(learner.actor, observation).sample(key)[0]
 
     def learn(
-        self, data: Params, learner: SACLearner, batch: Remembered, key: jax.Array
+        self, learner: SACLearner, batch: Remembered, key: jax.Array
     ) -> tuple[SACLearner, Metrics]:
         target_key, actor_key = jax.random.split(key)
         temperature = jnp.exp(learner.log_temperature)
-        action, log_prob = self._policy(data, learner.actor, batch.following).sample(target_key)
+        action, log_prob = self.distribution(learner.actor, batch.following).sample(target_key)
         later = jnp.min(self.twins(learner.target, batch.following, action), axis=0)
         learner, value_loss = self.fit_critics(learner, batch, later - temperature * log_prob)
 
         def actor_loss(actor: Params) -> tuple[jax.Array, jax.Array]:
-            policy = self._policy(data, actor, batch.observation)
+            policy = self.distribution(actor, batch.observation)
             action, log_prob = policy.sample(actor_key)
             value = jnp.minimum(*self.twins(learner.critics, batch.observation, action))
             cost = self.penalty(policy.mean, value)
             return cost + jnp.mean(temperature * log_prob - value), -jnp.mean(log_prob)
 
-        (policy_loss, entropy), gradient = jax.value_and_grad(actor_loss, has_aux=True)(
-            learner.actor
-        )
-        actor, actor_optimizer = self.descend(gradient, learner.actor_optimizer, learner.actor)
-        log_temperature, temperature_optimizer = self.descend(
+        learner, policy_loss, entropy = self.fit_actor(learner, actor_loss)
+        log_temperature, optimizer = self.descend(
             entropy - self.config.target_entropy,
             learner.temperature_optimizer,
             learner.log_temperature,
-        )
-        tau = self.config.tau
-        learner = replace(
-            learner,
-            actor=actor,
-            averaged=optax.incremental_update(actor, learner.averaged, tau),
-            target=optax.incremental_update(learner.critics, learner.target, tau),
-            log_temperature=log_temperature,
-            actor_optimizer=actor_optimizer,
-            temperature_optimizer=temperature_optimizer,
         )
         metrics = {
             "value_loss": value_loss,
@@ -104,7 +81,5 @@ class SAC(OffPolicy[SACLearner]):
             "entropy": entropy,
             "temperature": temperature,
         }
+        learner = replace(learner, log_temperature=log_temperature, temperature_optimizer=optimizer)
         return learner, metrics
-
-    def _policy(self, data: Params, actor: Params, observation: jax.Array) -> TanhNormal:
-        return cast(TanhNormal, self.actor(data).apply(actor, observation))
