@@ -321,7 +321,7 @@ def _adapted(config: TrainConfig, command: Navigation) -> TrainConfig:
         planning = config.planning or ImprovementConfig()
         config = replace(config, planning=planning if command.planning else None)
     if command.suites:
-        config = replace(config, worlds=None)
+        config = replace(config, terrain=None)
     if command.seed is not None:
-        config = replace(config, worlds=None, seed=command.seed)
+        config = replace(config, terrain=None, seed=command.seed)
     return replace(config, ground=grounds)

@@ -46,7 +46,7 @@ def load(
     """
     config = replace(experiment.load(run / "config.yaml"), planning=None)
     if suite:
-        config = replace(config, worlds=None)
+        config = replace(config, terrain=None)
         config = replace(config, ground=replace(config.ground, suites=(suite,)))
     if weights:
         config = replace(config, weights=weights)
