@@ -296,9 +296,8 @@ def _navigate(command: Navigation) -> None:
         policies = {REFERENCE: policies[REFERENCE]}
     with processes.simulating(command.jobs) as mapped:
         judge = external.judge_in(command.simulator, config, terrain, mapped)
-        suites = None if config.terrain else config.ground.world_suites
         key = config.key("testing")
-        groups = report.drive(test.env, test.params, policies, key, suites, judge)
+        groups = report.drive(test.env, test.params, policies, key, config.world_suites, judge)
     print(f"\n{report.markdown(groups, REFERENCE)}")
     if command.output:
         radius = config.navigation.goal_radius

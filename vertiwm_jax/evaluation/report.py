@@ -57,9 +57,8 @@ def after_training(trained: Trained) -> str:
     machine.forget_programs()  # Tests need the memory.
     test = experiment.test_environment(config, trained.held_out)
     policies = experiment.learned(config, folder) | config.baselines
-    given = trained.given or config.terrain is not None
-    suites = None if given else config.ground.world_suites
-    groups = drive(test.env, test.params, policies, config.key("testing"), suites)
+    key = config.key("testing")
+    groups = drive(test.env, test.params, policies, key, trained.world_suites)
     write(folder, groups, REFERENCE, test.params.terrain, config.navigation.goal_radius)
     return markdown(groups, REFERENCE)
 

@@ -1,7 +1,6 @@
 """Driving policies as what is learned: the settings of a training, its environments, and `run`."""
 
 import logging
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, cast
@@ -17,7 +16,7 @@ from vertiwm_jax.env.action_repeat import ActionRepeat
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.randomization import RandomizationConfig
-from vertiwm_jax.env.suites import GroundConfig
+from vertiwm_jax.env.suites import GroundConfig, Suite
 from vertiwm_jax.env.task import NavigationConfig, TaskParams
 from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason
@@ -89,6 +88,11 @@ class TaskConfig:
         return vehicle.load(self.vehicle)
 
     @property
+    def world_suites(self) -> list[Suite] | None:
+        """The suite of each world that is held out; None of given maps."""
+        return None if self.terrain else self.ground.world_suites
+
+    @property
     def baselines(self) -> dict[str, Policy]:
         """The controllers that policies are compared with and may correct."""
         return controllers.baselines(self.navigation, self.driven.vehicle)
@@ -100,10 +104,14 @@ class TaskConfig:
 
 
 @configuration.settings
-class TrainConfig(TaskConfig, ABC):
-    """Settings of every training; `name` is that of its algorithm's settings among them."""
+class TrainConfig(TaskConfig):
+    """Settings of every training.
+
+    kind: its algorithm; name: that of the algorithm's settings among these.
+    """
 
     name: ClassVar[str]
+    kind: ClassVar[type[PolicyAlgorithm[Any]]]
 
     runs: Path = Path("runs")
     """Folder in which the folder of this run is made."""
@@ -127,9 +135,10 @@ class TrainConfig(TaskConfig, ABC):
         """The algorithm's settings."""
         return getattr(self, self.name)
 
-    @abstractmethod
     def algorithm(self, env: NavigationEnv) -> PolicyAlgorithm[Any]:
         """The algorithm on the task, as configured."""
+        repeated = ActionRepeat(env, self.action_repeat, self.controller)
+        return self.kind(repeated, self.schedule, outcomes, env.config.observed.layout)
 
     @property
     def controller(self) -> Policy | None:
@@ -153,21 +162,15 @@ class TrainConfig(TaskConfig, ABC):
             seeds=self.loop.seeds,
         )
 
-    def repeated(self, env: NavigationEnv) -> ActionRepeat:
-        """The task as algorithms see it."""
-        return ActionRepeat(env, self.action_repeat, self.controller)
-
 
 @configuration.settings
 class PPOTraining(TrainConfig):
     """Train an off-road driving policy by PPO inside a model of the vehicle."""
 
     name: ClassVar[str] = "ppo"
+    kind: ClassVar[type[PolicyAlgorithm[Any]]] = PPO
     ppo: PPOConfig = PPOConfig()
     """The algorithm."""
-
-    def algorithm(self, env: NavigationEnv) -> PPO:
-        return PPO(self.repeated(env), self.ppo, outcomes, env.config.observed.layout)
 
 
 @configuration.settings
@@ -175,11 +178,9 @@ class SACTraining(TrainConfig):
     """Train an off-road driving policy by SAC inside a model of the vehicle."""
 
     name: ClassVar[str] = "sac"
+    kind: ClassVar[type[PolicyAlgorithm[Any]]] = SAC
     sac: SACConfig = SACConfig()
     """The algorithm."""
-
-    def algorithm(self, env: NavigationEnv) -> SAC:
-        return SAC(self.repeated(env), self.sac, outcomes, env.config.observed.layout)
 
 
 @configuration.settings
@@ -187,11 +188,9 @@ class TD3Training(TrainConfig):
     """Train an off-road driving policy by TD3 inside a model of the vehicle."""
 
     name: ClassVar[str] = "td3"
+    kind: ClassVar[type[PolicyAlgorithm[Any]]] = TD3
     td3: TD3Config = TD3Config()
     """The algorithm."""
-
-    def algorithm(self, env: NavigationEnv) -> TD3:
-        return TD3(self.repeated(env), self.td3, outcomes, env.config.observed.layout)
 
 
 TRAININGS: dict[str, type[TrainConfig]] = {
@@ -224,19 +223,18 @@ def training_environment(config: TaskConfig) -> tuple[Task, TerrainMap]:
 
 
 def training_ground(
-    config: TaskConfig, given: TerrainMap | None = None
+    config: TaskConfig, worlds: TerrainMap | None = None
 ) -> tuple[TerrainMap, Tasks, TerrainMap]:
     """The worlds to train on, tasks on them, and the worlds held out for `test_environment`.
 
-    given: worlds to train and to test on, in place of those of the configuration. Raises `MapError`
-    or `TaskError` where maps, or tasks on them, cannot be used.
+    worlds: to train and to test on, in place of those of the configuration. Raises `MapError` or
+    `TaskError` where maps, or tasks on them, cannot be used.
     """
     navigation, driven = config.navigation, config.driven
     key = config.key("worlds")
-    if given is None:
+    terrain = held_out = worlds
+    if terrain is None or held_out is None:
         terrain, held_out = suites.grounds(config.ground, config.terrain, key, driven.scale)
-    else:
-        terrain = held_out = given
     # Now, and not when the training is over.
     tests = suites.test_tasks(config.ground, held_out)
     tasks.validate(tests, held_out, navigation.goal_radius, navigation.map_margin)
@@ -304,17 +302,19 @@ def outcomes(info: dict[str, jax.Array]) -> dict[str, jax.Array]:
 
 @dataclass(frozen=True)
 class Trained:
-    """What a training has left: its folder, with what has learned, and worlds to test it on."""
+    """What a training has left: its folder, with what has learned, and worlds to test it on.
+
+    world_suites: of each of these worlds; None where they were given.
+    """
 
     config: TrainConfig
     folder: Path
     held_out: TerrainMap
-    given: bool = False
-    """Whether these were given as arrays."""
+    world_suites: list[Suite] | None
 
 
-def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
-    """Trains, or goes on with, the policies of one training; given: as in `training_ground`.
+def run(config: TrainConfig, worlds: TerrainMap | None = None) -> Trained:
+    """Trains, or goes on with, the policies of one training; worlds: as in `training_ground`.
 
     Tells by logging what it does. Raises `UserError` where settings, maps, tasks, an earlier run or
     the disk do not allow it, and `TrainingInterrupted` at Ctrl-C once all is saved.
@@ -325,12 +325,12 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
     absolute = {name: path and path.absolute() for name, path in paths.items()}
     config = replace(config, operands=config.multiplied, **absolute)
     _log.info("drawing worlds ...")
-    terrain, pool, held_out = training_ground(config, given)
+    terrain, pool, held_out = training_ground(config, worlds)
     machine.forget_programs()
     moves, weights = dynamics(config, config.model)
     env = NavigationEnv(moves, config.navigation, config.variation)
-    driven = config.driven.vehicle, encoders(config)
-    shapes = env.make_params(weights, terrain, pool, *driven, settled=False)
+    given = weights, terrain, pool, config.driven.vehicle, encoders(config)
+    shapes = env.make_params(*given, settled=False)
     algorithm = config.algorithm(env)
     seeds = Seeds(algorithm, config.loop.seeds)
     restored = training.restore(seeds, shapes, config.resume) if config.resume else None
@@ -338,7 +338,7 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
         # Now, while there are no vehicles yet that fill the memory.
         training.compiled(seeds, shapes)
     _log.info("placing vehicles for %s tasks ...", f"{len(pool.world):,}")
-    params = env.make_params(weights, terrain, pool, *driven)
+    params = env.make_params(*given)
     machine.forget_programs()
     with Run.begin(config, config.name, restored[0] if restored else 0, config.wandb) as begun:
         _log.info("run folder %s", begun.folder)
@@ -356,7 +356,7 @@ def run(config: TrainConfig, given: TerrainMap | None = None) -> Trained:
             seeds, params, key, begun, iterations, work, config.loop, restored, keep
         )
         keep(state)
-    return Trained(config, begun.folder, held_out, given is not None)
+    return Trained(config, begun.folder, held_out, None if worlds else config.world_suites)
 
 
 def train(
