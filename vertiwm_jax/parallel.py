@@ -216,18 +216,9 @@ def shared_out(function: Callable[..., T], batch: int) -> Callable[..., T]:
     return on_mesh
 
 
-def share(tree: T) -> T:
-    """A pytree with leaves `[B, ...]`, each device with a share of the rows; it divides B."""
-    return _placed(tree, ROWS)
-
-
-def whole(tree: T) -> T:
-    """A pytree of which every device has all."""
-    return _placed(tree, WHOLE)
-
-
-def _placed(tree: T, places: PartitionSpec) -> T:
-    return jax.lax.with_sharding_constraint(tree, places) if number() > 1 else tree
+def placed(tree: T, spec: PartitionSpec) -> T:
+    """A pytree, inside of a program, whose leaves all devices have whole or share out by rows."""
+    return jax.lax.with_sharding_constraint(tree, spec) if number() > 1 else tree
 
 
 def _mesh(devices: np.ndarray) -> Mesh:

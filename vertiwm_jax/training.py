@@ -224,9 +224,14 @@ def train(
             seconds = time.perf_counter() - start
             done += 1
             if not np.all(metrics.pop("finite")):
-                raise TrainingError(_diverged(done, checkpoints.latest(folder)))
-            scalars = {name: _mean(value) for name, value in metrics.items()}
-            scalars = {name: value for name, value in scalars.items() if value is not None}
+                last = checkpoints.latest(folder)
+                left = f"the last good checkpoint is {last}" if last else "nothing was saved yet"
+                raise TrainingError(
+                    f"iteration {done}: loss or weights are no longer finite; {left}; "
+                    "try a lower learning rate, and look for inputs that are not finite"
+                )
+            known = {name: values[~np.isnan(values)] for name, values in metrics.items()}
+            scalars = {name: float(values.mean()) for name, values in known.items() if values.size}
             scalars[work.unit] = done * work.amount
             scalars[f"{work.unit}_per_second"] = work.amount / seconds
             run.log(done, scalars)
@@ -259,20 +264,6 @@ def _compiled(algorithm: Algorithm[Any], mesh: Mesh, kind: Any, shapes: tuple[An
     machine.release_memory()
     _log.info("compiled in %.0f s", time.perf_counter() - start)
     return done
-
-
-def _mean(values: np.ndarray) -> float | None:
-    """Mean over those that have a value; None if none has."""
-    values = values[~np.isnan(values)]
-    return float(values.mean()) if values.size else None
-
-
-def _diverged(iteration: int, checkpoint: Path | None) -> str:
-    left = f"the last good checkpoint is {checkpoint}" if checkpoint else "nothing was saved yet"
-    return (
-        f"iteration {iteration}: loss or weights are no longer finite; {left}; "
-        "try a lower learning rate, and look for inputs that are not finite"
-    )
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from gymnax.environments.spaces import gymnax_space_to_gym_space
 
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.render import from_above
@@ -17,14 +18,6 @@ from vertiwm_jax.state import STEP_SECONDS
 
 FRAMES_PER_SECOND = round(1 / STEP_SECONDS)
 _ENDINGS = np.array([reason.name.lower() for reason in TerminationReason])
-
-
-def _spaces(env: NavigationEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    seen, action = env.observation_space(), env.action_space()
-    return (
-        gymnasium.spaces.Box(seen.low, seen.high, seen.shape, np.float32),
-        gymnasium.spaces.Box(action.low, action.high, action.shape, np.float32),
-    )
 
 
 # Equal environments share what these compile.
@@ -60,7 +53,8 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f'render_mode: expected None or "rgb_array", found {render_mode!r}')
-        self.observation_space, self.action_space = _spaces(env)
+        self.observation_space = gymnax_space_to_gym_space(env.observation_space())
+        self.action_space = gymnax_space_to_gym_space(env.action_space())
         self.render_mode = render_mode
         self._env, self._params = env, params
         self._state: TaskState | None = None
@@ -106,7 +100,8 @@ class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def __init__(self, env: NavigationEnv, params: TaskParams, num_envs: int) -> None:
         self.num_envs = num_envs
-        self.single_observation_space, self.single_action_space = _spaces(env)
+        self.single_observation_space = gymnax_space_to_gym_space(env.observation_space())
+        self.single_action_space = gymnax_space_to_gym_space(env.action_space())
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._env, self._params = env, params

@@ -153,8 +153,8 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         stalled = jnp.where(is_stalled, state.stalled + running, 0)
         time = jnp.int32(state.time) + running
         distance, _ = observation.distance_and_bearing(vehicle.position, state.goal)
-        roll, pitch, yaw = vehicle.rpy
-        xy = vehicle.position[:2]
+        (roll, pitch, yaw), xy = vehicle.rpy, vehicle.position[:2]
+        tilt = jnp.maximum(jnp.abs(roll), jnp.abs(pitch))
         size = params.vehicle.length, params.vehicle.width
         ending = first_ending(
             {
@@ -163,8 +163,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
                 TerminationReason.STUCK: stalled * STEP_SECONDS >= config.stuck_seconds,
                 TerminationReason.COLLIDED: obstacles.collides(terrain, xy, yaw, *size),
                 TerminationReason.OFF_MAP: edge_distance(terrain, xy) < config.map_margin,
-                TerminationReason.ROLLED_OVER: jnp.maximum(jnp.abs(roll), jnp.abs(pitch))
-                > config.rollover_angle,
+                TerminationReason.ROLLED_OVER: tilt > config.rollover_angle,
                 TerminationReason.DIVERGED: ~plausible,
             }
         )

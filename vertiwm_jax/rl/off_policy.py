@@ -152,13 +152,8 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         key, reset_key, learner_key = jax.random.split(key, 3)
         begun = self.start(data, reset_key, key)
         observation = begun["environments"].observation[0]
-        row = Remembered(
-            observation=observation,
-            following=observation,
-            action=jnp.zeros(self.actions),
-            reward=jnp.float32(0),
-            terminated=jnp.array(False),
-        )
+        nothing = jnp.zeros(self.actions), jnp.float32(0), jnp.array(False)
+        row = Remembered(observation, observation, *nothing)
         return OffPolicyState(
             **begun,
             learner=self.init_learner(observation, learner_key),
@@ -286,15 +281,10 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         running, steps, following = collect.step(
             self.env, data, self.outcomes, config.discount, running, action, keys
         )
-        rows = Remembered(
-            observation=steps.observation,
-            following=following,
-            action=action,
-            reward=steps.reward,
-            terminated=steps.terminated,
-        )
+        seen = steps.observation
+        rows = Remembered(seen, following, action, steps.reward, steps.terminated)
         state = self.with_statistics(state, steps)
-        replay = state.replay.add(parallel.whole(rows))
+        replay = state.replay.add(parallel.placed(rows, parallel.WHOLE))
         return replace(state, replay=replay, environments=running), steps
 
     def _learn(self, state: OffPolicyState[L], key: jax.Array) -> tuple[OffPolicyState[L], Metrics]:
@@ -302,7 +292,8 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
 
         def update(learner: L, key: jax.Array) -> tuple[L, Metrics]:
             sample_key, learn_key = jax.random.split(key)
-            batch = parallel.share(state.replay.sample(sample_key, self.config.batch))
+            batch = state.replay.sample(sample_key, self.config.batch)
+            batch = parallel.placed(batch, parallel.ROWS)
             batch = replace(
                 batch,
                 observation=state.observations.normalize(batch.observation),

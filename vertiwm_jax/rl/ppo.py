@@ -86,24 +86,12 @@ steps of each environment are learned from, in each epoch.
 
 
 @struct.dataclass
-class Rollout:
-    """Steps as collected, `[T, N]`, and what the networks of that time made of them.
-
-    log_prob: of the actions, which are not clipped; value, next_value: of what was seen before and
-        after the step, unless an episode has terminated.
-    """
-
-    steps: Steps
-    log_prob: jax.Array
-    value: jax.Array
-    next_value: jax.Array
-
-
-@struct.dataclass
 class Batch:
     """What the loss is made of, `[T, N]` as collected, or `[B]` of them.
 
-    `target` is a lambda return; observation, advantage: in the loss, normalized.
+    log_prob: of the actions, which are not clipped, and value: as the networks had them when the
+        steps were collected; target: lambda returns.
+    observation, advantage: normalized once they are learned from.
     """
 
     observation: jax.Array
@@ -192,27 +180,18 @@ class PPO(PolicyAlgorithm[TrainState]):
         """An iteration of one device with N environments of its own."""
         config, (noise, keys, order) = self.config, draws
         with jax.named_scope("collect"):
-            running, rollout = self._collect(data, state, noise, keys)
+            running, steps, log_prob, value, next_value = self._collect(data, state, noise, keys)
         with jax.named_scope("advantages"):
-            steps, values = rollout.steps, (rollout.value, rollout.next_value)
             # Observations from the next iteration on: within one, all are normalized alike.
             following = self.with_statistics(state, steps)
-            ends = steps.terminated, steps.truncated
             rewards = steps.reward / following.returns.std
-            advantage = gae(rewards, *values, *ends, config.discount, config.gae_lambda)
-            batch = Batch(
-                observation=steps.observation,
-                action=steps.action,
-                log_prob=rollout.log_prob,
-                value=rollout.value,
-                advantage=advantage,
-                target=advantage + rollout.value,
-            )
+            given = rewards, value, next_value, steps.terminated, steps.truncated
+            advantage = gae(*given, config.discount, config.gae_lambda)
+            target = advantage + value
+            batch = Batch(steps.observation, steps.action, log_prob, value, advantage, target)
         with jax.named_scope("update"):
             params, optimizer, losses = self._update(state, batch, order)
-        (_, unexplained), (_, variance) = map(
-            parallel.moments, (batch.target - batch.value, batch.target)
-        )
+        (_, unexplained), (_, variance) = map(parallel.moments, (target - value, target))
         metrics = {
             **losses,
             **collect.episode_metrics(steps),
@@ -225,8 +204,11 @@ class PPO(PolicyAlgorithm[TrainState]):
 
     def _collect(
         self, data: Params, state: TrainState, noise: jax.Array, keys: jax.Array
-    ) -> tuple[Environments, Rollout]:
-        """T steps of N environments with the policy as it is."""
+    ) -> tuple[Environments, Steps, jax.Array, jax.Array, jax.Array]:
+        """T steps of N environments with the policy as it is.
+
+        Also log probabilities of actions, and values `[T, N]` before and after the steps.
+        """
         actor, discount = self.actor, self.config.discount
 
         def value_of(observation: jax.Array) -> jax.Array:
@@ -234,7 +216,7 @@ class PPO(PolicyAlgorithm[TrainState]):
 
         def advance(
             running: Environments, draw: tuple[jax.Array, jax.Array]
-        ) -> tuple[Environments, Rollout]:
+        ) -> tuple[Environments, tuple[Steps, jax.Array, jax.Array, jax.Array]]:
             noise, keys = draw
             seen = state.observations.normalize(running.observation)
             policy = cast(Gaussian, actor.apply(state.params["actor"], seen))
@@ -247,12 +229,12 @@ class PPO(PolicyAlgorithm[TrainState]):
                 jnp.any(steps.truncated), value_of, lambda x: jnp.zeros(len(x)), final
             )
             value = self._value(state.params, seen)
-            return running, Rollout(steps, policy.log_prob(action), value, next_value)
+            return running, (steps, policy.log_prob(action), value, next_value)
 
-        running, rollout = jax.lax.scan(advance, state.environments, (noise, keys))
-        following = jnp.concatenate([rollout.value[1:], value_of(running.observation)[None]])
-        next_value = jnp.where(rollout.steps.done, rollout.next_value, following)
-        return running, replace(rollout, next_value=next_value)
+        running, collected = jax.lax.scan(advance, state.environments, (noise, keys))
+        steps, log_prob, value, next_value = collected
+        following = jnp.concatenate([value[1:], value_of(running.observation)[None]])
+        return running, steps, log_prob, value, jnp.where(steps.done, next_value, following)
 
     def _update(
         self, state: TrainState, batch: Batch, order: jax.Array
