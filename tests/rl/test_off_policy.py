@@ -134,7 +134,7 @@ def test_nothing_is_learned_while_warming_up(name):
     two, metrics = train(target, iterations=2)  # whose last step has what is needed
     assert np.isfinite(metrics["value_loss"])
     if name == "td3":
-        assert int(two.learner.update) == target.config.updates
+        assert int(two.learner.extra) == target.config.updates
 
 
 @each

@@ -1,7 +1,8 @@
-"""What all algorithms that learn a policy share: settings, with the defaults of PPO, and seams."""
+"""What all algorithms that learn a policy share: settings, environments side by side, and seams."""
 
 import math
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, TypeVar
 
@@ -11,6 +12,7 @@ import optax
 from flax import struct
 from gymnax.environments.environment import Environment
 
+from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, Positive, Share, settings
 from vertiwm_jax.env.action_repeat import ActionRepeat
 from vertiwm_jax.networks.policy import (
@@ -20,11 +22,56 @@ from vertiwm_jax.networks.policy import (
     ObservationLayout,
     TanhNormalActor,
 )
-from vertiwm_jax.rl import collect
-from vertiwm_jax.rl.collect import Environments, Outcomes, Steps
 from vertiwm_jax.rl.learned import DeterministicPolicy, Value
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.training import Algorithm
+
+Metrics = dict[str, jax.Array]
+Outcomes = Callable[[dict[str, jax.Array]], Metrics]
+"""What to report of an episode, from the `info` of its last step: named scalars."""
+
+
+@struct.dataclass
+class Environments:
+    """N running environments.
+
+    state: the environment's own, leaves `[N, ...]`.
+    observation: `[N, O]` what the policy sees next, not normalized.
+    discounted_return: `[N]` of the running episode so far.
+    episode_return, episode_length: `[N]` undiscounted sum of rewards and steps so far.
+    """
+
+    state: Any
+    observation: jax.Array
+    discounted_return: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+
+
+@struct.dataclass
+class Steps:
+    """Steps of environments, `[..., N]`.
+
+    observation: `[..., N, O]` before the step, not normalized; action: `[..., N, A]` as chosen, 1
+        being the end of its range; terminated: what follows is worth nothing; truncated: time ran
+        out; discounted_return, episode_return, episode_length: of the episodes, with this step;
+        outcomes: leaves `[..., N]`, which mean something where an episode ended.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    discounted_return: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+    outcomes: Metrics
+
+    @property
+    def done(self) -> jax.Array:
+        """`[..., N]` whether an episode ended."""
+        return self.terminated | self.truncated
 
 
 @settings
@@ -140,15 +187,52 @@ class PolicyAlgorithm(Algorithm[S]):
         return Value(self.critic, self.weights(state)[1], self.policy(state), state.returns.std)
 
     def start(self, data: Any, reset_key: jax.Array, key: jax.Array) -> dict[str, Any]:
-        """The fields of a `LearningState` before the first iteration, which has `key`."""
-        running = collect.start(self.env, data, self.config.num_envs, reset_key)
+        """The fields of a `LearningState` at the beginning of all episodes; `key` is its own."""
+        keys = jax.random.split(reset_key, self.config.num_envs)
+        observation, state = jax.vmap(self.env.reset, (0, None))(keys, data)
+        zeros = jnp.zeros(len(keys))
         return {
             "iteration": jnp.int32(0),
             "key": key,
-            "observations": RunningStatistics.create(running.observation.shape[1:]),
+            "observations": RunningStatistics.create(observation.shape[1:]),
             "returns": RunningStatistics.create(()),
-            "environments": running,
+            "environments": Environments(state, observation, zeros, zeros, zeros),
         }
+
+    def step(
+        self, data: Any, environments: Environments, action: jax.Array, keys: jax.Array
+    ) -> tuple[Environments, Steps, jax.Array]:
+        """A step of N environments; episodes that end begin anew.
+
+        Args:
+            action: `[N, A]`, clipped to [-1, 1] and scaled to the environment's range.
+            keys: `[N]` random keys.
+
+        Returns:
+            The environments after the step, the step, and the observations `[N, O]` after it and
+            before any new beginning.
+        """
+        space = self.env.action_space(data)
+        low, high = jnp.asarray(space.low), jnp.asarray(space.high)
+        bounded = low + (high - low) * (jnp.clip(action, -1, 1) + 1) / 2
+        step_all = parallel.vmap(self.env.step, (0, 0, 0, None))
+        observation, state, reward, terminated, truncated, info = step_all(
+            keys, environments.state, bounded, data
+        )
+        steps = Steps(
+            observation=environments.observation,
+            action=action,
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            discounted_return=self.config.discount * environments.discounted_return + reward,
+            episode_return=environments.episode_return + reward,
+            episode_length=environments.episode_length + 1,
+            outcomes=jax.vmap(self.outcomes)(info),
+        )
+        totals = steps.discounted_return, steps.episode_return, steps.episode_length
+        running = (jnp.where(steps.done, 0.0, total) for total in totals)
+        return Environments(state, observation, *running), steps, info["final_observation"]
 
     def with_statistics(self, state: S, steps: Steps) -> S:
         """The state with these steps in the statistics that are in use."""
@@ -158,3 +242,19 @@ class PolicyAlgorithm(Algorithm[S]):
         if self.config.normalize_observations:
             observations = observations.update(steps.observation)
         return replace(state, returns=returns, observations=observations)
+
+
+def episode_metrics(steps: Steps) -> Metrics:
+    """Means over the episodes that ended on all devices, and how many did; NaN if none."""
+
+    def sum_of_last(x: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.where(steps.done, x, 0.0))
+
+    last = {
+        "episode_return": steps.episode_return,
+        "episode_length": steps.episode_length,
+        **steps.outcomes,
+    }
+    count = jnp.sum(steps.done, dtype=jnp.float32)
+    count, sums = parallel.total((count, jax.tree.map(sum_of_last, last)))
+    return {"episodes": count, **jax.tree.map(lambda x: x / count, sums)}

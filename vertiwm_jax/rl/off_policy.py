@@ -8,7 +8,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +18,14 @@ from flax import struct
 from vertiwm_jax import parallel
 from vertiwm_jax.config import ConfigError, Count, NotNegative, Positive, Share, settings
 from vertiwm_jax.networks.policy import ActionCritic, TanhNormal, TanhNormalActor, twin_values
-from vertiwm_jax.rl import collect
-from vertiwm_jax.rl.algorithm import LearningConfig, LearningState, PolicyAlgorithm
-from vertiwm_jax.rl.collect import Metrics, Steps
+from vertiwm_jax.rl.algorithm import (
+    LearningConfig,
+    LearningState,
+    Metrics,
+    PolicyAlgorithm,
+    Steps,
+    episode_metrics,
+)
 from vertiwm_jax.rl.replay import Replay
 from vertiwm_jax.training import all_finite
 
@@ -87,7 +92,8 @@ class Learner:
     """What both have learned: weights, and the states of Adam.
 
     averaged: the actor over its updates, which drives in the end, for single gradient steps throw
-        the actor about; critics: two, with an axis for them; target: of the critics, behind them.
+        the actor about; critics: two, with an axis for them; target: of the critics, behind them;
+    extra: what only one algorithm keeps.
     """
 
     actor: Params
@@ -96,24 +102,22 @@ class Learner:
     target: Params
     actor_optimizer: Any
     critic_optimizer: Any
-
-
-L = TypeVar("L", bound=Learner)
+    extra: Any
 
 
 @struct.dataclass
-class OffPolicyState(LearningState, Generic[L]):
+class OffPolicyState(LearningState):
     """All that training carries from one iteration to the next.
 
     learner: what was learned; replay: of `Remembered`.
     """
 
-    learner: L
+    learner: Learner
     replay: Replay
 
 
 @dataclass(frozen=True)
-class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
+class OffPolicy(PolicyAlgorithm[OffPolicyState]):
     """Learns from replayed steps; an algorithm says how it explores and learns from a batch."""
 
     config: OffPolicyConfig
@@ -132,22 +136,22 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
     def critic(self) -> ActionCritic:
         return ActionCritic(self.config.hidden, self.layout)
 
-    def weights(self, state: OffPolicyState[L]) -> tuple[Params, Params]:
+    def weights(self, state: OffPolicyState) -> tuple[Params, Params]:
         return state.learner.averaged, state.learner.critics
 
     @abstractmethod
-    def init_learner(self, observation: jax.Array, key: jax.Array) -> L:
-        """The learner before the first batch; `observation` `[O]`."""
+    def init_extra(self) -> Any:
+        """What the learner keeps of its own before the first batch."""
 
     @abstractmethod
-    def explore(self, learner: L, observation: jax.Array, key: jax.Array) -> jax.Array:
+    def explore(self, learner: Learner, observation: jax.Array, key: jax.Array) -> jax.Array:
         """`[N, O]` normalized observations to `[N, A]` actions in [-1, 1]."""
 
     @abstractmethod
-    def learn(self, learner: L, batch: Remembered, key: jax.Array) -> tuple[L, Metrics]:
+    def learn(self, learner: Learner, batch: Remembered, key: jax.Array) -> tuple[Learner, Metrics]:
         """A gradient step on a normalized batch; the metrics are scalars, NaN for none."""
 
-    def init(self, data: Params, key: jax.Array) -> OffPolicyState[L]:
+    def init(self, data: Params, key: jax.Array) -> OffPolicyState:
         """The state before the first iteration."""
         key, reset_key, learner_key = jax.random.split(key, 3)
         begun = self.start(data, reset_key, key)
@@ -156,11 +160,11 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         row = Remembered(observation, observation, *nothing)
         return OffPolicyState(
             **begun,
-            learner=self.init_learner(observation, learner_key),
+            learner=self._init_learner(observation, learner_key),
             replay=Replay.create(row, self.config.buffer_size),
         )
 
-    def iterate(self, data: Params, state: OffPolicyState[L]) -> tuple[OffPolicyState[L], Metrics]:
+    def iterate(self, data: Params, state: OffPolicyState) -> tuple[OffPolicyState, Metrics]:
         """`num_steps` steps of all environments, each with its gradient steps; jit it, donated.
 
         The metrics are scalars. Those of episodes are means over the episodes that ended in
@@ -170,8 +174,8 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         keys = jax.random.split(steps_key, self.config.num_steps)
 
         def advance(
-            state: OffPolicyState[L], key: jax.Array
-        ) -> tuple[OffPolicyState[L], tuple[Steps, Metrics]]:
+            state: OffPolicyState, key: jax.Array
+        ) -> tuple[OffPolicyState, tuple[Steps, Metrics]]:
             collect_key, learn_key = jax.random.split(key)
             with jax.named_scope("collect"):
                 state, steps = self._collect(data, state, collect_key)
@@ -182,14 +186,13 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         state, (steps, losses) = jax.lax.scan(advance, state, keys)
         metrics = {
             **jax.tree.map(jnp.nanmean, losses),
-            **collect.episode_metrics(steps),
+            **episode_metrics(steps),
             "reward": jnp.mean(steps.reward),
             "finite": all_finite(state.learner),
         }
         return replace(state, iteration=state.iteration + 1, key=key), metrics
 
-    def init_weights(self, observation: jax.Array, key: jax.Array) -> dict[str, Params]:
-        """The fields of a `Learner`; targets are copies of their own, for states are donated."""
+    def _init_learner(self, observation: jax.Array, key: jax.Array) -> Learner:
         actor_key, critic_key = jax.random.split(key)
         action = jnp.zeros(self.actions)
         # One after the other, as `training.Seeds` does with seeds.
@@ -197,14 +200,16 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
             lambda key: self.critic.init(key, observation, action), jax.random.split(critic_key)
         )
         actor = self.actor.init(actor_key, observation)
-        return {
-            "actor": actor,
-            "averaged": jax.tree.map(jnp.array, actor),
-            "critics": critics,
-            "target": jax.tree.map(jnp.array, critics),
-            "actor_optimizer": self.optimizer.init(actor),
-            "critic_optimizer": self.optimizer.init(critics),
-        }
+        # Targets are copies of their own, for states are donated.
+        return Learner(
+            actor=actor,
+            averaged=jax.tree.map(jnp.array, actor),
+            critics=critics,
+            target=jax.tree.map(jnp.array, critics),
+            actor_optimizer=self.optimizer.init(actor),
+            critic_optimizer=self.optimizer.init(critics),
+            extra=self.init_extra(),
+        )
 
     def distribution(self, actor: Params, observation: jax.Array) -> TanhNormal:
         """The policy at normalized observations `[..., O]`."""
@@ -214,7 +219,9 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         """`[2, ...]` values of actions, as both critics have them."""
         return twin_values(self.critic, critics, observation, action)
 
-    def fit_critics(self, learner: L, batch: Remembered, later: jax.Array) -> tuple[L, jax.Array]:
+    def fit_critics(
+        self, learner: Learner, batch: Remembered, later: jax.Array
+    ) -> tuple[Learner, jax.Array]:
         """A gradient step of both critics; also the loss.
 
         later: `[B]` values of what follows, 0 where nothing does.
@@ -230,8 +237,8 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         return replace(learner, critics=critics, critic_optimizer=optimizer), value
 
     def fit_actor(
-        self, learner: L, loss: Callable[[Params], tuple[jax.Array, Any]]
-    ) -> tuple[L, jax.Array, Any]:
+        self, learner: Learner, loss: Callable[[Params], tuple[jax.Array, Any]]
+    ) -> tuple[Learner, jax.Array, Any]:
         """A gradient step of the actor, after which its average and the targets follow.
 
         loss: of the actor's weights, with anything beside it; both are given back.
@@ -263,34 +270,32 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
         """Of actor and critics."""
         return self.config.adam(self.config.learning_rate, eps=1e-8)
 
-    def _exploring(self, state: OffPolicyState[L]) -> jax.Array:
+    def _exploring(self, state: OffPolicyState) -> jax.Array:
         """Whether actions are still random, and nothing is learned."""
         return state.replay.filled < self.config.learning_starts
 
     def _collect(
-        self, data: Params, state: OffPolicyState[L], key: jax.Array
-    ) -> tuple[OffPolicyState[L], Steps]:
+        self, data: Params, state: OffPolicyState, key: jax.Array
+    ) -> tuple[OffPolicyState, Steps]:
         """A step of all environments, remembered."""
         explore_key, random_key, step_key = jax.random.split(key, 3)
-        running, config = state.environments, self.config
+        running = state.environments
         seen = state.observations.normalize(running.observation)
         chosen = self.explore(state.learner, seen, explore_key)
         anything = jax.random.uniform(random_key, chosen.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(self._exploring(state), anything, chosen)
-        keys = jax.random.split(step_key, config.num_envs)
-        running, steps, following = collect.step(
-            self.env, data, self.outcomes, config.discount, running, action, keys
-        )
+        keys = jax.random.split(step_key, self.config.num_envs)
+        running, steps, following = self.step(data, running, action, keys)
         seen = steps.observation
         rows = Remembered(seen, following, action, steps.reward, steps.terminated)
         state = self.with_statistics(state, steps)
         replay = state.replay.add(parallel.placed(rows, parallel.WHOLE))
         return replace(state, replay=replay, environments=running), steps
 
-    def _learn(self, state: OffPolicyState[L], key: jax.Array) -> tuple[OffPolicyState[L], Metrics]:
+    def _learn(self, state: OffPolicyState, key: jax.Array) -> tuple[OffPolicyState, Metrics]:
         """`updates` gradient steps, none while exploring; the metrics are means."""
 
-        def update(learner: L, key: jax.Array) -> tuple[L, Metrics]:
+        def update(learner: Learner, key: jax.Array) -> tuple[Learner, Metrics]:
             sample_key, learn_key = jax.random.split(key)
             batch = state.replay.sample(sample_key, self.config.batch)
             batch = parallel.placed(batch, parallel.ROWS)
@@ -302,12 +307,12 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState[L]]):
             )
             return self.learn(learner, batch, learn_key)
 
-        def updates(learner: L) -> tuple[L, Metrics]:
+        def updates(learner: Learner) -> tuple[Learner, Metrics]:
             keys = jax.random.split(key, self.config.updates)
             learner, losses = jax.lax.scan(update, learner, keys)
             return learner, jax.tree.map(jnp.nanmean, losses)
 
-        def none(learner: L) -> tuple[L, Metrics]:
+        def none(learner: Learner) -> tuple[Learner, Metrics]:
             nothing = jax.eval_shape(updates, learner)[1]
             return learner, jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), nothing)
 

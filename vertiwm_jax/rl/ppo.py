@@ -20,9 +20,15 @@ from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, NotNegative, Positive, Share, settings
 from vertiwm_jax.networks.policy import Actor, Critic, Gaussian
 from vertiwm_jax.parallel import BATCH, ROWS, WHOLE
-from vertiwm_jax.rl import collect
-from vertiwm_jax.rl.algorithm import LearningConfig, LearningState, PolicyAlgorithm
-from vertiwm_jax.rl.collect import Environments, Metrics, Steps
+from vertiwm_jax.rl.algorithm import (
+    Environments,
+    LearningConfig,
+    LearningState,
+    Metrics,
+    PolicyAlgorithm,
+    Steps,
+    episode_metrics,
+)
 from vertiwm_jax.rl.gae import gae
 from vertiwm_jax.training import all_finite, mean_in_turns
 
@@ -194,7 +200,7 @@ class PPO(PolicyAlgorithm[TrainState]):
         (_, unexplained), (_, variance) = map(parallel.moments, (target - value, target))
         metrics = {
             **losses,
-            **collect.episode_metrics(steps),
+            **episode_metrics(steps),
             "reward": parallel.mean(jnp.mean(steps.reward)),
             "explained_variance": 1 - unexplained / variance,
             "finite": all_finite((params, losses)),
@@ -209,7 +215,6 @@ class PPO(PolicyAlgorithm[TrainState]):
 
         Also log probabilities of actions, and values `[T, N]` before and after the steps.
         """
-        actor, discount = self.actor, self.config.discount
 
         def value_of(observation: jax.Array) -> jax.Array:
             return self._value(state.params, state.observations.normalize(observation))
@@ -219,11 +224,9 @@ class PPO(PolicyAlgorithm[TrainState]):
         ) -> tuple[Environments, tuple[Steps, jax.Array, jax.Array, jax.Array]]:
             noise, keys = draw
             seen = state.observations.normalize(running.observation)
-            policy = cast(Gaussian, actor.apply(state.params["actor"], seen))
+            policy = cast(Gaussian, self.actor.apply(state.params["actor"], seen))
             action = policy.mean + jnp.exp(policy.log_std) * noise
-            running, steps, final = collect.step(
-                self.env, data, self.outcomes, discount, running, action, keys
-            )
+            running, steps, final = self.step(data, running, action, keys)
             # What follows is valued one step later, unless an episode was cut off.
             next_value = jax.lax.cond(
                 jnp.any(steps.truncated), value_of, lambda x: jnp.zeros(len(x)), final

@@ -9,10 +9,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 
 from vertiwm_jax.config import Positive, settings
-from vertiwm_jax.rl.collect import Metrics
+from vertiwm_jax.rl.algorithm import Metrics
 from vertiwm_jax.rl.off_policy import Learner, OffPolicy, OffPolicyConfig, Params, Remembered
 
 
@@ -28,36 +27,23 @@ class SACConfig(OffPolicyConfig):
     """Entropy, nats, of the actions in [-1, 1] that the temperature is adjusted to keep."""
 
 
-@struct.dataclass
-class SACLearner(Learner):
-    """What SAC has learned, with the temperature and its state of Adam."""
-
-    log_temperature: jax.Array
-    temperature_optimizer: Any
-
-
 @dataclass(frozen=True)
-class SAC(OffPolicy[SACLearner]):
-    """Soft actor-critic."""
+class SAC(OffPolicy):
+    """Soft actor-critic; its learner also keeps the log temperature and the state of its Adam."""
 
     config: SACConfig
 
-    def init_learner(self, observation: jax.Array, key: jax.Array) -> SACLearner:
+    def init_extra(self) -> tuple[jax.Array, Any]:
         log_temperature = jnp.log(jnp.float32(self.config.initial_temperature))
-        return SACLearner(
-            **self.init_weights(observation, key),
-            log_temperature=log_temperature,
-            temperature_optimizer=self.optimizer.init(log_temperature),
-        )
+        return log_temperature, self.optimizer.init(log_temperature)
 
-    def explore(self, learner: SACLearner, observation: jax.Array, key: jax.Array) -> jax.Array:
+    def explore(self, learner: Learner, observation: jax.Array, key: jax.Array) -> jax.Array:
         return self.distribution(learner.actor, observation).sample(key)[0]
 
-    def learn(
-        self, learner: SACLearner, batch: Remembered, key: jax.Array
-    ) -> tuple[SACLearner, Metrics]:
+    def learn(self, learner: Learner, batch: Remembered, key: jax.Array) -> tuple[Learner, Metrics]:
         target_key, actor_key = jax.random.split(key)
-        temperature = jnp.exp(learner.log_temperature)
+        log_temperature, optimizer = learner.extra
+        temperature = jnp.exp(log_temperature)
         action, log_prob = self.distribution(learner.actor, batch.following).sample(target_key)
         later = jnp.min(self.twins(learner.target, batch.following, action), axis=0)
         learner, value_loss = self.fit_critics(learner, batch, later - temperature * log_prob)
@@ -70,16 +56,12 @@ class SAC(OffPolicy[SACLearner]):
             return cost + jnp.mean(temperature * log_prob - value), -jnp.mean(log_prob)
 
         learner, policy_loss, entropy = self.fit_actor(learner, actor_loss)
-        log_temperature, optimizer = self.descend(
-            entropy - self.config.target_entropy,
-            learner.temperature_optimizer,
-            learner.log_temperature,
-        )
+        excess = entropy - self.config.target_entropy
+        learner = replace(learner, extra=self.descend(excess, optimizer, log_temperature))
         metrics = {
             "value_loss": value_loss,
             "policy_loss": policy_loss,
             "entropy": entropy,
             "temperature": temperature,
         }
-        learner = replace(learner, log_temperature=log_temperature, temperature_optimizer=optimizer)
         return learner, metrics

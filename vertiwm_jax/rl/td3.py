@@ -4,10 +4,9 @@ from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 
 from vertiwm_jax.config import Count, NotNegative, settings
-from vertiwm_jax.rl.collect import Metrics
+from vertiwm_jax.rl.algorithm import Metrics
 from vertiwm_jax.rl.off_policy import Learner, OffPolicy, OffPolicyConfig, Params, Remembered
 
 
@@ -25,30 +24,21 @@ class TD3Config(OffPolicyConfig):
     """Gradient steps of the critics for each of the actor and of the targets."""
 
 
-@struct.dataclass
-class TD3Learner(Learner):
-    """What TD3 has learned; `averaged` is its target actor; update: `[]` int32, gradient steps."""
-
-    update: jax.Array
-
-
 @dataclass(frozen=True)
-class TD3(OffPolicy[TD3Learner]):
-    """Twin delayed deep deterministic policy gradient."""
+class TD3(OffPolicy):
+    """TD3; its learner also keeps the number of gradient steps, `[]` int32."""
 
     config: TD3Config
 
-    def init_learner(self, observation: jax.Array, key: jax.Array) -> TD3Learner:
-        return TD3Learner(**self.init_weights(observation, key), update=jnp.int32(0))
+    def init_extra(self) -> jax.Array:
+        return jnp.int32(0)
 
-    def explore(self, learner: TD3Learner, observation: jax.Array, key: jax.Array) -> jax.Array:
+    def explore(self, learner: Learner, observation: jax.Array, key: jax.Array) -> jax.Array:
         action = self.distribution(learner.actor, observation).mean
         noise = self.config.exploration_noise * jax.random.normal(key, action.shape)
         return jnp.clip(action + noise, -1.0, 1.0)
 
-    def learn(
-        self, learner: TD3Learner, batch: Remembered, key: jax.Array
-    ) -> tuple[TD3Learner, Metrics]:
+    def learn(self, learner: Learner, batch: Remembered, key: jax.Array) -> tuple[Learner, Metrics]:
         config = self.config
         action = self.distribution(learner.averaged, batch.following).mean
         noise = config.target_noise * jax.random.normal(key, action.shape)
@@ -56,9 +46,9 @@ class TD3(OffPolicy[TD3Learner]):
         action = jnp.clip(action + noise, -1.0, 1.0)
         later = jnp.min(self.twins(learner.target, batch.following, action), axis=0)
         learner, value_loss = self.fit_critics(learner, batch, later)
-        learner = replace(learner, update=learner.update + 1)
+        learner = replace(learner, extra=learner.extra + 1)
 
-        def improve(learner: TD3Learner) -> tuple[TD3Learner, jax.Array]:
+        def improve(learner: Learner) -> tuple[Learner, jax.Array]:
             def actor_loss(actor: Params) -> tuple[jax.Array, None]:
                 action = self.distribution(actor, batch.observation).mean
                 value = self.twins(learner.critics, batch.observation, action)[0]
@@ -66,9 +56,9 @@ class TD3(OffPolicy[TD3Learner]):
 
             return self.fit_actor(learner, actor_loss)[:2]
 
-        def keep(learner: TD3Learner) -> tuple[TD3Learner, jax.Array]:
+        def keep(learner: Learner) -> tuple[Learner, jax.Array]:
             return learner, jnp.float32(jnp.nan)
 
-        due = learner.update % config.policy_delay == 0
+        due = learner.extra % config.policy_delay == 0
         learner, policy_loss = jax.lax.cond(due, improve, keep, learner)
         return learner, {"value_loss": value_loss, "policy_loss": policy_loss}

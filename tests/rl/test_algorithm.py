@@ -3,22 +3,22 @@ import jax.numpy as jnp
 import numpy as np
 from rl.probes import Delayed, Endless, ProbeParams, Target
 
-from vertiwm_jax.rl import collect
-
-DISCOUNT = 0.9
+from vertiwm_jax.rl.algorithm import episode_metrics
+from vertiwm_jax.rl.ppo import PPO, PPOConfig
 
 
 def roll(env, params, actions):
     """Steps `[T, N]` of given actions `[T, N, 1]`, and what came after each step."""
 
+    config = PPOConfig(num_envs=actions.shape[1], discount=0.9)
+    algorithm = PPO(env, config, lambda info: {"time": info["time"]})
+
     def advance(running, inputs):
-        action, keys = inputs
-        running, experience, final = collect.step(
-            env, params, lambda info: {"time": info["time"]}, DISCOUNT, running, action, keys
-        )
+        running, experience, final = algorithm.step(params, running, *inputs)
         return running, (experience, final, running.observation)
 
-    start = collect.start(env, params, actions.shape[1], jax.random.key(0))
+    key = jax.random.key(0)
+    start = algorithm.start(params, key, key)["environments"]
     keys = jax.random.split(jax.random.key(1), actions.shape[:2])
     return jax.lax.scan(advance, start, (actions, keys))[1]
 
@@ -39,14 +39,14 @@ def test_a_truncated_episode_ends_without_termination():
     assert not bool(jnp.any(experience.terminated))
     expected = [1, 1.9, 2.71, 1, 1.9, 2.71]
     np.testing.assert_allclose(experience.discounted_return[:, 0], expected, rtol=1e-6)
-    means = collect.episode_metrics(experience)
+    means = episode_metrics(experience)
     assert float(means["episodes"]) == 2 and float(means["episode_length"]) == 3
     assert float(means["time"]) == 3
 
 
 def test_no_episode_has_no_mean():
     experience, _, _ = roll(Endless(), ProbeParams(), jnp.zeros((2, 1, 1)))
-    means = collect.episode_metrics(experience)
+    means = episode_metrics(experience)
     assert float(means["episodes"]) == 0 and bool(jnp.isnan(means["episode_return"]))
 
 
