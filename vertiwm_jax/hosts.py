@@ -22,8 +22,7 @@ T = TypeVar("T")
 
 COMMANDS = ("ppo", "sac", "td3", "fit")
 """Commands that several hosts can run together."""
-_PROCESSES, _PROCESS = "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
-_VARIABLES = ("JAX_COORDINATOR_ADDRESS", _PROCESSES, _PROCESS)
+_VARIABLES = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
 _LONGEST_PATH = 4096  # bytes
 _PATIENCE = 60  # seconds that a process waits for the others at its end, whatever ended it
 
@@ -45,10 +44,9 @@ def join(command: str) -> None:
     # Its handler would swallow SIGTERM, at which a training saves and stops.
     jax.config.update("jax_enable_preemption_service", False)
     try:
+        number, own = (int(os.environ[x]) if x in os.environ else None for x in _VARIABLES[1:])
         jax.distributed.initialize(
-            num_processes=_number(_PROCESSES),
-            process_id=_number(_PROCESS),
-            shutdown_timeout_seconds=_PATIENCE,
+            num_processes=number, process_id=own, shutdown_timeout_seconds=_PATIENCE
         )
     except (ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
@@ -127,15 +125,6 @@ def with_keys(like: T, tree: Any) -> T:
 
 def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(jnp.result_type(leaf), jax.dtypes.prng_key)
-
-
-def _number(name: str) -> int | None:
-    text = os.environ.get(name)
-    if text is None:
-        return None
-    if not text.isdecimal():
-        sys.exit(f"error: {name}: expected a whole number, found {text!r}")
-    return int(text)
 
 
 def _found() -> str:

@@ -8,8 +8,8 @@ from gymnasium.vector import AutoresetMode
 
 import vertiwm_jax.gym
 from vertiwm_jax.env.gymnasium import NavigationGymEnv, NavigationVectorEnv
+from vertiwm_jax.env.suites import circle_tasks
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.env.tasks import circle_tasks
 
 
 @pytest.fixture(scope="module")

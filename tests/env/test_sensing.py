@@ -10,8 +10,8 @@ import pytest
 from env.worlds import bicycle_env, ground, hills, step_of_many, task
 
 from vertiwm_jax.env.observation import LAYOUT, arcs_ahead
+from vertiwm_jax.env.suites import circle_tasks
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.terrain.sensing import SensingConfig
 

@@ -5,8 +5,8 @@ import pytest
 from env.worlds import bicycle_env, ground, hills
 
 from vertiwm_jax.env.gymnasium import NavigationGymEnv
+from vertiwm_jax.env.suites import circle_tasks
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.env.tasks import circle_tasks
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from env.worlds import GRASS, ground, hills, task
 
-from vertiwm_jax.env import tasks
+from vertiwm_jax.env import suites
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.terrain import map as terrain_map
@@ -13,7 +13,7 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 
 def test_circle_is_verti_bench():
-    pool = tasks.circle_tasks(terrain_map.stack([ground(), ground()]))
+    pool = suites.circle_tasks(terrain_map.stack([ground(), ground()]))
     assert pool.world.tolist() == [0] * 10 + [1] * 10
     np.testing.assert_allclose(np.linalg.norm(pool.start, axis=-1), 60, rtol=1e-6)
     np.testing.assert_allclose(pool.goal, -pool.start, atol=1e-5)
@@ -23,7 +23,7 @@ def test_circle_is_verti_bench():
 
 def test_circle_must_fit():
     with pytest.raises(ValueError, match="radius 70 m does not fit on a map of 128 x 128 m"):
-        tasks.circle_tasks(ground(), radius=70)
+        suites.circle_tasks(ground(), radius=70)
 
 
 def test_slope_around_a_plane_is_its_own():
@@ -31,7 +31,7 @@ def test_slope_around_a_plane_is_its_own():
     plane = ground(0.06 * x + 0.05 * x[:, None]).select(0)
     points = jnp.array([[0.0, 0.0], [20.3, -31.7]])
     np.testing.assert_allclose(
-        tasks.slope_around(plane, points), np.arctan(np.hypot(0.06, 0.05)), rtol=1e-3
+        suites.slope_around(plane, points), np.arctan(np.hypot(0.06, 0.05)), rtol=1e-3
     )
 
 
@@ -40,7 +40,7 @@ def test_sway_turns_starts_to_level_ground():
     rough = 1 + np.sin(np.add.outer(np.arange(129.0), np.arange(129.0)))
     rough[:64, 65:] = 1
     terrain = terrain_map.stack([ground(rough), ground(rough[::-1].copy())])
-    still, swayed = (tasks.circle_tasks(terrain, pairs=4, sway=s) for s in (0.0, np.pi / 4))
+    still, swayed = (suites.circle_tasks(terrain, pairs=4, sway=s) for s in (0.0, np.pi / 4))
     np.testing.assert_allclose(np.linalg.norm(swayed.start, axis=-1), 60, rtol=1e-6)
     np.testing.assert_allclose(swayed.goal, -swayed.start, atol=1e-5)
     heading = np.stack([np.cos(swayed.yaw), np.sin(swayed.yaw)], axis=-1)
@@ -49,7 +49,7 @@ def test_sway_turns_starts_to_level_ground():
     assert turned.min() >= np.cos(np.pi / 4) - 1e-5
     # East, north, west, south: two of them reach the level quadrant of their world.
     slopes = [
-        np.asarray(tasks.slope_around(terrain.select(world), swayed.start[4 * world :][:4]))
+        np.asarray(suites.slope_around(terrain.select(world), swayed.start[4 * world :][:4]))
         for world in (0, 1)
     ]
     assert (slopes[0] < 0.01).tolist() == [True, True, False, False]
@@ -61,7 +61,7 @@ def test_random_tasks_are_acceptable_and_varied():
     relief = hills(height=2.5)
     blocks = np.array([[x, y, 6, 6, 3] for x in (-30, 0, 30) for y in (-30, 0, 30)])
     terrain = terrain_map.stack([ground(relief, blocks), ground(relief.T.copy(), blocks)])
-    pool = tasks.random_tasks(jax.random.key(0), terrain, 200, load_vehicle())
+    pool = suites.random_tasks(jax.random.key(0), terrain, 200, load_vehicle())
     assert np.bincount(pool.world).tolist() == [100, 100]
     offset = np.asarray(pool.goal - pool.start)
     distance = np.linalg.norm(offset, axis=-1)
@@ -89,7 +89,7 @@ def test_random_tasks_are_acceptable_and_varied():
 def test_impossible_random_tasks_say_why():
     with pytest.raises(ValueError, match=r"for 3 of 3 tasks, on worlds \[0\]"):
         small = TerrainMap.from_array(np.zeros((17, 17)), np.full((2, 2), GRASS))
-        tasks.random_tasks(jax.random.key(0), small, 3, load_vehicle())
+        suites.random_tasks(jax.random.key(0), small, 3, load_vehicle())
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_impossible_random_tasks_say_why():
 )
 def test_bad_tasks_are_named(pool, message):
     with pytest.raises(ValueError, match=message):
-        tasks.validate(pool, ground(), 8.0, 1.0)
+        suites.validate(pool, ground(), 8.0, 1.0)
 
 
 def test_edge_distance():

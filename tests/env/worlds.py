@@ -10,8 +10,8 @@ import numpy as np
 
 from vertiwm_jax.env.agent import Now
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import NavigationConfig, TaskParams
-from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.mechanics.kinematic import BicycleParams, KinematicBicycle
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap

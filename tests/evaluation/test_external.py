@@ -9,8 +9,8 @@ from env.worlds import SNOW, hills
 from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason as Reason
 from vertiwm_jax.evaluation import external
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like

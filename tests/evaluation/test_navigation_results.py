@@ -13,8 +13,8 @@ from vertiwm_jax import machine, parallel
 from vertiwm_jax.env.agent import Agent, Now
 from vertiwm_jax.env.controllers import RandomActions, StraightToGoal
 from vertiwm_jax.env.episodes import run_episodes
+from vertiwm_jax.env.suites import circle_tasks
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation import navigation
 from vertiwm_jax.terrain import map as terrain_map

@@ -5,7 +5,7 @@ from env.worlds import bicycle_env, ground
 from faults.border import fault
 
 from vertiwm_jax.env.gymnasium import NavigationVectorEnv
-from vertiwm_jax.env.tasks import circle_tasks
+from vertiwm_jax.env.suites import circle_tasks
 
 
 @fault(AssertionError, "options are not looked at, and all vehicles begin anew")

@@ -8,8 +8,8 @@ from importers.bags import Bag
 
 from vertiwm_jax.env.controllers import StraightToGoal
 from vertiwm_jax.env.episodes import run_episodes
+from vertiwm_jax.env.suites import circle_tasks
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.env.tasks import circle_tasks
 from vertiwm_jax.importers import grid_map
 from vertiwm_jax.importers.settings import Frames, GridMapSettings
 from vertiwm_jax.terrain import files

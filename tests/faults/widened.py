@@ -18,7 +18,7 @@ import vertiwm_jax.gym  # Registers the task.
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, rollout
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.tasks import circle_tasks
+from vertiwm_jax.env.suites import circle_tasks
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of, place
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import load_vehicle

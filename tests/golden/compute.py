@@ -26,8 +26,8 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.reward import RewardConfig
+from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.learning import pipeline, stages
 from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.learning.fitting import Fit, FitInputs, Problem, merge

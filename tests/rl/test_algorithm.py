@@ -3,7 +3,6 @@ import jax.numpy as jnp
 import numpy as np
 from rl.probes import Delayed, Endless, ProbeParams, Target
 
-from vertiwm_jax.rl.algorithm import episode_metrics
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 
 
@@ -39,14 +38,14 @@ def test_a_truncated_episode_ends_without_termination():
     assert not bool(jnp.any(experience.terminated))
     expected = [1, 1.9, 2.71, 1, 1.9, 2.71]
     np.testing.assert_allclose(experience.discounted_return[:, 0], expected, rtol=1e-6)
-    means = episode_metrics(experience)
+    means = experience.episode_metrics()
     assert float(means["episodes"]) == 2 and float(means["episode_length"]) == 3
     assert float(means["time"]) == 3
 
 
 def test_no_episode_has_no_mean():
     experience, _, _ = roll(Endless(), ProbeParams(), jnp.zeros((2, 1, 1)))
-    means = episode_metrics(experience)
+    means = experience.episode_metrics()
     assert float(means["episodes"]) == 0 and bool(jnp.isnan(means["episode_return"]))
 
 

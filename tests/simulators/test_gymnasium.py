@@ -12,8 +12,8 @@ from gymnasium.utils.env_checker import check_env
 
 from vertiwm_jax.env.gymnasium import NavigationGymEnv
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason as Reason
 from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like

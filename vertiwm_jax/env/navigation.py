@@ -11,21 +11,12 @@ import numpy as np
 from gymnax.environments import environment, spaces
 
 from vertiwm_jax import machine, parallel, xla
-from vertiwm_jax.dynamics import (
-    Dynamics,
-    History,
-    Params,
-    disagreement,
-    embedding,
-    spread,
-    step,
-)
+from vertiwm_jax.dynamics import Dynamics, History, Params, disagreement, embedding, spread, step
 from vertiwm_jax.env import observation, route, suites
 from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
 from vertiwm_jax.env.reward import reward
-from vertiwm_jax.env.suites import GroundConfig
+from vertiwm_jax.env.suites import GroundConfig, TaskError, Tasks, validate
 from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState
-from vertiwm_jax.env.tasks import TaskError, Tasks, validate
 from vertiwm_jax.env.termination import TerminationReason, edge_distance, first_ending, is_terminal
 from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, load_vehicle
@@ -120,11 +111,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         return seen, dataclasses.replace(state, variation=variation)
 
     def step_env(
-        self,
-        key: jax.Array,
-        state: TaskState,
-        action: int | float | jax.Array,
-        params: TaskParams,
+        self, key: jax.Array, state: TaskState, action: int | float | jax.Array, params: TaskParams
     ) -> tuple[jax.Array, TaskState, jax.Array, jax.Array, dict[Any, Any]]:
         """One step of 0.1 s; a state that diverged is replaced by the last plausible one.
 

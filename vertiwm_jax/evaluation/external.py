@@ -13,8 +13,8 @@ from vertiwm_jax.env import episodes, suites
 from vertiwm_jax.env.agent import Agent, Policy, as_agent
 from vertiwm_jax.env.episodes import NavigationResult, run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import TaskParams
-from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.evaluation.report import Judge
 from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.models.registry import ModelName

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from dataclasses import replace
+from operator import attrgetter
 
 import jax
 import jax.numpy as jnp
@@ -161,20 +162,9 @@ class OpenLoopPlanner(Planner):
 
     config: OpenLoopConfig = struct.field(pytree_node=False)
 
-    @property
-    def interval(self) -> int:
-        """Steps that a decision is held."""
-        return self.config.interval
-
-    @property
-    def discount(self) -> float:
-        """For each decision."""
-        return self.config.discount
-
-    @property
-    def planned(self) -> int:
-        """All decisions of a plan are kept."""
-        return self.config.decisions
+    interval = property(attrgetter("config.interval"))
+    discount = property(attrgetter("config.discount"))
+    planned = property(attrgetter("config.decisions"))
 
     def intended(self, now: Now, memory: Plan) -> jax.Array:
         """`[D, 2]` the last plan moved on by a decision; after its end the last one again."""

@@ -73,13 +73,24 @@ class Steps:
         """`[..., N]` whether an episode ended."""
         return self.terminated | self.truncated
 
+    def episode_metrics(self) -> Metrics:
+        """Means over the episodes that ended on all devices, and how many did; NaN if none."""
+
+        def sum_of_last(x: jax.Array) -> jax.Array:
+            return jnp.sum(jnp.where(self.done, x, 0.0))
+
+        own = {"episode_return": self.episode_return, "episode_length": self.episode_length}
+        count = jnp.sum(self.done, dtype=jnp.float32)
+        count, sums = parallel.total((count, jax.tree.map(sum_of_last, own | self.outcomes)))
+        return {"episodes": count, **jax.tree.map(lambda x: x / count, sums)}
+
 
 @settings
 class LearningConfig:
     """How much is experienced, and what networks learn from it."""
 
     GONE: ClassVar[dict[str, str]] = {
-        "transitions": "is now total_timesteps, action_repeat times as many",
+        "transitions": "is now total_timesteps, action_repeat times as many"
     }
 
     total_timesteps: Count = 1_310_720
@@ -242,19 +253,3 @@ class PolicyAlgorithm(Algorithm[S]):
         if self.config.normalize_observations:
             observations = observations.update(steps.observation)
         return replace(state, returns=returns, observations=observations)
-
-
-def episode_metrics(steps: Steps) -> Metrics:
-    """Means over the episodes that ended on all devices, and how many did; NaN if none."""
-
-    def sum_of_last(x: jax.Array) -> jax.Array:
-        return jnp.sum(jnp.where(steps.done, x, 0.0))
-
-    last = {
-        "episode_return": steps.episode_return,
-        "episode_length": steps.episode_length,
-        **steps.outcomes,
-    }
-    count = jnp.sum(steps.done, dtype=jnp.float32)
-    count, sums = parallel.total((count, jax.tree.map(sum_of_last, last)))
-    return {"episodes": count, **jax.tree.map(lambda x: x / count, sums)}

@@ -11,14 +11,13 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax import machine, training
 from vertiwm_jax.config import ConfigError, Count
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.env import controllers, suites, tasks
+from vertiwm_jax.env import controllers, suites
 from vertiwm_jax.env.action_repeat import ActionRepeat
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.randomization import RandomizationConfig
-from vertiwm_jax.env.suites import GroundConfig, Suite
+from vertiwm_jax.env.suites import GroundConfig, Suite, Tasks
 from vertiwm_jax.env.task import NavigationConfig, TaskParams
-from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
@@ -237,7 +236,7 @@ def training_ground(
         terrain, held_out = suites.grounds(config.ground, config.terrain, key, driven.scale)
     # Now, and not when the training is over.
     tests = suites.test_tasks(config.ground, held_out)
-    tasks.validate(tests, held_out, navigation.goal_radius, navigation.map_margin)
+    suites.validate(tests, held_out, navigation.goal_radius, navigation.map_margin)
     pool = suites.training_tasks(config.ground, terrain, driven.vehicle, config.key("tasks"))
     return terrain, pool, held_out
 

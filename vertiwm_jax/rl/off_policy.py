@@ -18,14 +18,7 @@ from flax import struct
 from vertiwm_jax import parallel
 from vertiwm_jax.config import ConfigError, Count, NotNegative, Positive, Share, settings
 from vertiwm_jax.networks.policy import ActionCritic, TanhNormal, TanhNormalActor, twin_values
-from vertiwm_jax.rl.algorithm import (
-    LearningConfig,
-    LearningState,
-    Metrics,
-    PolicyAlgorithm,
-    Steps,
-    episode_metrics,
-)
+from vertiwm_jax.rl.algorithm import LearningConfig, LearningState, Metrics, PolicyAlgorithm, Steps
 from vertiwm_jax.rl.replay import Replay
 from vertiwm_jax.training import all_finite
 
@@ -186,7 +179,7 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState]):
         state, (steps, losses) = jax.lax.scan(advance, state, keys)
         metrics = {
             **jax.tree.map(jnp.nanmean, losses),
-            **episode_metrics(steps),
+            **steps.episode_metrics(),
             "reward": jnp.mean(steps.reward),
             "finite": all_finite(state.learner),
         }

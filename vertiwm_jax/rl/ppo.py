@@ -20,15 +20,7 @@ from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, NotNegative, Positive, Share, settings
 from vertiwm_jax.networks.policy import Actor, Critic, Gaussian
 from vertiwm_jax.parallel import BATCH, ROWS, WHOLE
-from vertiwm_jax.rl.algorithm import (
-    Environments,
-    LearningConfig,
-    LearningState,
-    Metrics,
-    PolicyAlgorithm,
-    Steps,
-    episode_metrics,
-)
+from vertiwm_jax.rl.algorithm import LearningConfig, LearningState, Metrics, PolicyAlgorithm, Steps
 from vertiwm_jax.rl.gae import gae
 from vertiwm_jax.training import all_finite, mean_in_turns
 
@@ -53,8 +45,6 @@ class PPOConfig(LearningConfig):
     """Lambda of the generalized advantage estimator."""
     clip_eps: Positive = 0.2
     """Largest change of the probability ratio that is rewarded."""
-    value_clip: float | None = None
-    """Largest change of a value in an iteration; none by default."""
     schedule: Literal["constant", "linear", "cosine"] = "linear"
     """How the learning rate goes, to 0 at the end unless constant."""
     vf_coef: NotNegative = 0.5
@@ -95,15 +85,13 @@ steps of each environment are learned from, in each epoch.
 class Batch:
     """What the loss is made of, `[T, N]` as collected, or `[B]` of them.
 
-    log_prob: of the actions, which are not clipped, and value: as the networks had them when the
-        steps were collected; target: lambda returns.
+    log_prob: of the actions, which are not clipped, when they were drawn; target: lambda returns.
     observation, advantage: normalized once they are learned from.
     """
 
     observation: jax.Array
     action: jax.Array
     log_prob: jax.Array
-    value: jax.Array
     advantage: jax.Array
     target: jax.Array
 
@@ -194,13 +182,13 @@ class PPO(PolicyAlgorithm[TrainState]):
             given = rewards, value, next_value, steps.terminated, steps.truncated
             advantage = gae(*given, config.discount, config.gae_lambda)
             target = advantage + value
-            batch = Batch(steps.observation, steps.action, log_prob, value, advantage, target)
+            batch = Batch(steps.observation, steps.action, log_prob, advantage, target)
         with jax.named_scope("update"):
             params, optimizer, losses = self._update(state, batch, order)
         (_, unexplained), (_, variance) = map(parallel.moments, (target - value, target))
         metrics = {
             **losses,
-            **episode_metrics(steps),
+            **steps.episode_metrics(),
             "reward": parallel.mean(jnp.mean(steps.reward)),
             "explained_variance": 1 - unexplained / variance,
             "finite": all_finite((params, losses)),
@@ -210,7 +198,7 @@ class PPO(PolicyAlgorithm[TrainState]):
 
     def _collect(
         self, data: Params, state: TrainState, noise: jax.Array, keys: jax.Array
-    ) -> tuple[Environments, Steps, jax.Array, jax.Array, jax.Array]:
+    ) -> tuple[Any, Steps, jax.Array, jax.Array, jax.Array]:
         """T steps of N environments with the policy as it is.
 
         Also log probabilities of actions, and values `[T, N]` before and after the steps.
@@ -220,8 +208,8 @@ class PPO(PolicyAlgorithm[TrainState]):
             return self._value(state.params, state.observations.normalize(observation))
 
         def advance(
-            running: Environments, draw: tuple[jax.Array, jax.Array]
-        ) -> tuple[Environments, tuple[Steps, jax.Array, jax.Array, jax.Array]]:
+            running: Any, draw: tuple[jax.Array, jax.Array]
+        ) -> tuple[Any, tuple[Steps, jax.Array, jax.Array, jax.Array]]:
             noise, keys = draw
             seen = state.observations.normalize(running.observation)
             policy = cast(Gaussian, self.actor.apply(state.params["actor"], seen))
@@ -288,11 +276,7 @@ class PPO(PolicyAlgorithm[TrainState]):
         policy_loss = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
 
         value = self._value(params, batch.observation)
-        error = (value - batch.target) ** 2
-        if config.value_clip is not None:
-            change = jnp.clip(value - batch.value, -config.value_clip, config.value_clip)
-            error = jnp.maximum(error, (batch.value + change - batch.target) ** 2)
-        value_loss = 0.5 * jnp.mean(error)
+        value_loss = 0.5 * jnp.mean((value - batch.target) ** 2)
 
         entropy = policy.entropy()
         total = policy_loss + config.vf_coef * value_loss - config.ent_coef * entropy

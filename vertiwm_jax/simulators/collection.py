@@ -18,8 +18,8 @@ from vertiwm_jax import config as configuration
 from vertiwm_jax.config import Bounds, ConfigError, Count, settings
 from vertiwm_jax.env.agent import Policy, Reactive
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.learning import schema
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig

@@ -10,8 +10,8 @@ import numpy as np
 
 from vertiwm_jax.env.gymnasium import NavigationGymEnv
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import NavigationConfig, TaskState
-from vertiwm_jax.env.tasks import Tasks
 from vertiwm_jax.simulators import following
 from vertiwm_jax.simulators.following import Followed
 from vertiwm_jax.simulators.protocol import Simulator
