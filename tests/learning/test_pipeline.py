@@ -1,13 +1,11 @@
 """Whose physics is fitted; what is fitted, and in which order, is tested with the command."""
 
-from pathlib import Path
-
 import chex
 import jax
 import pytest
 from learning import recordings
 
-from vertiwm_jax.learning import pipeline, stages
+from vertiwm_jax.learning import calibration, pipeline, stages
 from vertiwm_jax.learning.pipeline import PipelineConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import load_vehicle
@@ -42,12 +40,23 @@ def test_a_vehicle_that_is_none_is_named():
         PipelineConfig(vehicle="rovr")
 
 
-def test_stages_from_nothing_are_of_their_vehicle():
-    """By what a stage knows its inputs by, whose file may have changed."""
+def test_stages_from_nothing_are_of_their_vehicle(tmp_path, monkeypatch):
+    """By the numbers of the vehicle, whose file may have changed."""
+    told = {}
 
-    def begun(name):
-        config = PipelineConfig(model=NESAM, vehicle=name)
-        run = Run(Path("."), None)
-        return pipeline._Pipeline(config, (), jax.random.key(0), run, (), None)._begun
+    def nothing_learned(run, name, inputs, params, *_):
+        told[name] = str(inputs)
+        return params
 
-    assert begun(None) == () and "mass=3.5" in begun("rover")[0]
+    monkeypatch.setattr(stages, "fit", nothing_learned)
+    monkeypatch.setattr(calibration, "nesam_constants", lambda nesam, params, *_: params)
+    recordings.write(tmp_path)
+    stage = {}
+    for name in (None, "rover"):
+        config, run = PipelineConfig(model=NESAM, vehicle=name), Run(tmp_path, None)
+        pipeline.fit(config, [tmp_path], jax.random.key(0), run)
+        stage[name] = dict(told)
+    assert "mass=3.5" in stage["rover"]["nesam_single_steps"]
+    assert stage[None]["nesam_single_steps"] != stage["rover"]["nesam_single_steps"]
+    # What the ground looks like is the same to all of them.
+    assert stage[None]["nesam_autoencoders"] == stage["rover"]["nesam_autoencoders"]

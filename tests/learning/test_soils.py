@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vertiwm_jax.learning.autoencoders import AutoencoderConfig, PatchData, Places
-from vertiwm_jax.learning.soils import SoilProblem
+from vertiwm_jax.learning.autoencoders import AutoencoderConfig, PatchData, Places, SoilProblem
 from vertiwm_jax.networks.encoder import LATENT_CHANNELS
 from vertiwm_jax.networks.soil_predictor import SoilPredictor
 from vertiwm_jax.perception.features import init_pair

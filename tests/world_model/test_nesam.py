@@ -209,9 +209,14 @@ def test_calibration_measures_what_physics_misses_and_how_it_answers():
     starts, control = standing(5, drives), commands(steps, drives)
     after = jax.vmap(lambda state, u: predict(Damped(), PHYSICS, state, u))(starts, control)
     states = jax.tree.map(lambda a, b: jnp.concatenate([a[:, None], b], 1), starts, after)
-    worlds = replace(TERRAIN, world=jnp.zeros(drives, jnp.int32))
-    constants = partial(calibration.nesam_constants, SIMPLE.specialist, UNTRAINED, worlds)
-    measured = jax.jit(lambda *drive: constants(*drive).nesam)
+
+    @jax.jit
+    def measured(states, control):
+        worlds = jnp.zeros(drives, jnp.int32)
+        recorded = Windows(states.vector, control.vector, worlds, worlds, context=0)
+        constants = calibration.nesam_constants
+        return constants(SIMPLE.specialist, UNTRAINED, TERRAIN, recorded).nesam
+
     params = measured(states, control)
     np.testing.assert_allclose(params.correction_scale, 0, atol=1e-4)
     # The increment is 0.02 s times the loss of velocity more than that of the mean velocity.

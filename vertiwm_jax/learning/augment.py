@@ -12,15 +12,11 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from vertiwm_jax import geometry
-from vertiwm_jax.learning.dataset import Array, WheelSignals
+from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.terrain.map import MapError, TerrainMap
-
-_OTHER_SIDE = np.array([1, 0, 3, 2])
-_EXCHANGED = np.array([1, 0, 2])
 
 
 def with_mirrored(terrain: TerrainMap) -> TerrainMap:
@@ -52,7 +48,10 @@ def with_mirrored(terrain: TerrainMap) -> TerrainMap:
 
 
 def mirror(windows: Windows, terrain: TerrainMap) -> Windows:
-    """The mirror images of windows on the original worlds of `with_mirrored`'s `terrain`."""
+    """The mirror images of windows on the original worlds of `with_mirrored`'s `terrain`.
+
+    Signals of the wheels are left out.
+    """
     state, control = windows.state, windows.control
     roll, pitch, yaw = state[..., 3], state[..., 4], state[..., 5]
     position = [_across(terrain, state[..., :2]), state[..., 2:3]]
@@ -63,36 +62,23 @@ def mirror(windows: Windows, terrain: TerrainMap) -> Windows:
         state=jnp.concatenate([*position, rpy, velocity], axis=-1),
         control=control * jnp.array([1.0, -1.0]),
         world=windows.world + terrain.worlds // 2,
-        wheels=_mirror_wheels(windows.wheels),
+        wheels=WheelSignals(),
     )
 
 
 def mirror_some(key: jax.Array, windows: Windows, terrain: TerrainMap) -> Windows:
-    """Mirrors each window with probability 1/2."""
+    """Mirrors each window with probability 1/2, and leaves out signals of the wheels."""
     chosen = jax.random.bernoulli(key, shape=windows.world.shape)
 
     def choose(image: jax.Array, original: jax.Array) -> jax.Array:
         return jnp.where(chosen.reshape(-1, *(1,) * (original.ndim - 1)), image, original)
 
-    return jax.tree.map(choose, mirror(windows, terrain), windows)
+    image = mirror(windows, terrain)
+    return jax.tree.map(choose, image, replace(windows, wheels=image.wheels))
 
 
 def _across(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     """Points `[..., 2]` with x and y exchanged about the center of the map."""
     half = 0.5 * (terrain.elevation.shape[1] - 1) * terrain.resolution
-    centre = terrain.origin + half * jnp.array([1.0, -1.0])
-    return centre + (xy - centre)[..., ::-1]
-
-
-def _mirror_wheels(recorded: WheelSignals) -> WheelSignals:
-    def other_side(wheels: Array | None) -> Array | None:
-        return None if wheels is None else wheels[..., _OTHER_SIDE]
-
-    force, chassis, steer = recorded.wheel_force, recorded.chassis_force, recorded.steer_angle
-    return WheelSignals(
-        wheel_omega=other_side(recorded.wheel_omega),
-        wheel_sinkage=other_side(recorded.wheel_sinkage),
-        wheel_force=None if force is None else force[..., _OTHER_SIDE, :][..., _EXCHANGED],
-        chassis_force=None if chassis is None else chassis[..., _EXCHANGED],
-        steer_angle=None if steer is None else -steer[..., ::-1],
-    )
+    center = terrain.origin + half * jnp.array([1.0, -1.0])
+    return center + (xy - center)[..., ::-1]

@@ -1,4 +1,4 @@
-"""Training of the terrain autoencoders to reconstruct patches of a collection's ground."""
+"""Learning to see the ground of drives: terrain autoencoders, and the soil predictor."""
 
 from dataclasses import dataclass
 from typing import Any, Self, cast
@@ -12,10 +12,12 @@ from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, NotNegative, settings
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning.dataset import Drives
-from vertiwm_jax.networks.encoder import TerrainAutoencoder
+from vertiwm_jax.networks.encoder import TerrainAutoencoder, TerrainEncoder
+from vertiwm_jax.networks.soil_predictor import SoilPredictor
 from vertiwm_jax.terrain import patches, query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.patches import PATCH_PIXELS, RELIEF_METRES, Patches
+from vertiwm_jax.terrain.soil import BOUNDS, Soil, to_unit
 
 _ELEVATION, _SEMANTIC = TerrainAutoencoder(1), TerrainAutoencoder(3)
 _NETWORKS = {"elevation": _ELEVATION, "semantic": _SEMANTIC}
@@ -74,14 +76,18 @@ class PatchData:
 
 
 @dataclass(frozen=True)
-class AutoencoderProblem:
-    """A `fitting.Problem`: the squared error of reconstructed elevations and colours."""
+class _PatchProblem:
+    """A `fitting.Problem` on patches of ground."""
 
     config: AutoencoderConfig
 
     @property
     def batch(self) -> int:
         return self.config.batch
+
+
+class AutoencoderProblem(_PatchProblem):
+    """A `fitting.Problem`: the squared error of reconstructed elevations and colors."""
 
     def init_params(self, key: jax.Array) -> Params:
         """Untrained networks `elevation` and `semantic`."""
@@ -94,45 +100,75 @@ class AutoencoderProblem:
 
     def loss(self, params: Params, data: PatchData, key: jax.Array) -> jax.Array:
         """The mean squared error `[]` of both, on patches near recorded places."""
-
-        def one(params: Params, terrain: TerrainMap, place: Places) -> jax.Array:
-            terrain = terrain.select(place.world)
-            seen = patches.query(terrain, place.position, place.yaw)
-            again = reconstruct(params, seen)
-            elevation = jnp.mean((again.elevation - seen.elevation) ** 2)
-            return elevation + jnp.mean((again.rgb - seen.rgb) ** 2)
-
-        places = near(data, key, self.config)
-        return jnp.mean(parallel.vmap(one, (None, None, 0))(params, data.terrain, places))
+        errors = parallel.vmap(_errors, (None, None, 0))
+        elevation, color, _ = errors(params, data.terrain, near(data, key, self.config))
+        return jnp.mean(elevation + color)
 
     def validate(self, params: Params, data: PatchData) -> dict[str, jax.Array]:
         """Errors of reconstruction at recorded poses; `error` is the loss there.
 
         elevation_rms: m, of heights as the patch has them, within its limits. colour_accuracy:
-        share of the pixels whose reconstructed colour is nearest to that of their own class.
+        share of the pixels whose reconstructed color is nearest to that of their own class.
         """
-        terrain, config = data.validation_terrain, self.config
-
-        def nearest(terrain: TerrainMap, rgb: jax.Array) -> jax.Array:
-            palette = terrain.class_rgb.astype(jnp.float32) / 127.5 - 1
-            return jnp.argmin(jnp.sum((rgb[..., None, :] - palette) ** 2, axis=-1), axis=-1)
-
-        def one(params: Params, terrain: TerrainMap, place: Places) -> tuple[jax.Array, ...]:
-            world = terrain.select(place.world)
-            seen = patches.query(world, place.position, place.yaw)
-            again = reconstruct(params, seen)
-            elevation = jnp.mean((again.elevation - seen.elevation) ** 2)
-            colour = jnp.mean((again.rgb - seen.rgb) ** 2)
-            same = nearest(terrain, again.rgb) == nearest(terrain, seen.rgb)
-            return elevation, colour, jnp.mean(same)
-
-        means = parallel.vmap(one, (None, None, 0), config.batch)(params, terrain, data.validation)
-        elevation, colour, accuracy = map(jnp.mean, means)
+        errors = parallel.vmap(_errors, (None, None, 0), self.config.batch)
+        found = errors(params, data.validation_terrain, data.validation)
+        elevation, color, accuracy = map(jnp.mean, found)
         return {
             "elevation_rms": RELIEF_METRES * jnp.sqrt(elevation),
             "colour_accuracy": accuracy,
-            "error": elevation + colour,
+            "error": elevation + color,
         }
+
+
+class SoilProblem(_PatchProblem):
+    """A `fitting.Problem`: the soil under the vehicle, from what the ground around it looks like.
+
+    The map's own soils supervise; places on rigid ground teach nothing. Parameters are
+    `semantic`, the frozen encoder of colors, and `soil`.
+    """
+
+    def loss(self, params: Params, data: PatchData, key: jax.Array) -> jax.Array:
+        """Mean squared error `[]` of the six parameters, each as its share of `BOUNDS`."""
+        places = near(data, key, self.config)
+        errors = parallel.vmap(self._error, (None, None, 0))
+        error, counts = errors(params, data.terrain, places)
+        return jnp.sum(jnp.mean(error**2, axis=-1)) / jnp.maximum(jnp.sum(counts), 1.0)
+
+    def validate(self, params: Params, data: PatchData) -> dict[str, jax.Array]:
+        """Root mean square errors at recorded places on soil, as shares of `BOUNDS`."""
+        errors = parallel.vmap(self._error, (None, None, 0), self.config.batch)
+        error, counts = errors(params, data.validation_terrain, data.validation)
+        square = jnp.sum(error**2, axis=0) / jnp.maximum(jnp.sum(counts), 1.0)
+        each = {f"error_{name}": jnp.sqrt(x) for name, x in zip(BOUNDS, square, strict=True)}
+        return {**each, "error": jnp.sqrt(jnp.mean(square))}
+
+    def _error(
+        self, params: Params, terrain: TerrainMap, place: Places
+    ) -> tuple[jax.Array, jax.Array]:
+        """`[6]` differences at one place, zero on rigid ground, and 1 on soil."""
+        world = terrain.select(place.world)
+        seen = patches.query(world, place.position, place.yaw)
+        encoder = jax.lax.stop_gradient(params["semantic"])
+        latent = cast(jax.Array, TerrainEncoder(3).apply(encoder, seen.rgb))
+        predicted = cast(Soil, SoilPredictor().apply(params["soil"], latent, jnp.float32(0)))
+        kind = query.surface(world, place.position[:2]).semantic
+        true = query.soil(world, kind)
+        soft = terrain.deformable[kind].astype(jnp.float32)
+        return soft * (to_unit(predicted) - to_unit(true)), soft
+
+
+def _errors(params: Params, terrain: TerrainMap, place: Places) -> tuple[jax.Array, ...]:
+    """Mean squared errors of elevation and color at one place, and the share of right colors."""
+    seen = patches.query(terrain.select(place.world), place.position, place.yaw)
+    again = reconstruct(params, seen)
+    elevation = jnp.mean((again.elevation - seen.elevation) ** 2)
+    palette = terrain.class_rgb.astype(jnp.float32) / 127.5 - 1
+
+    def nearest(rgb: jax.Array) -> jax.Array:
+        return jnp.argmin(jnp.sum((rgb[..., None, :] - palette) ** 2, axis=-1), axis=-1)
+
+    right = nearest(again.rgb) == nearest(seen.rgb)
+    return elevation, jnp.mean((again.rgb - seen.rgb) ** 2), jnp.mean(right)
 
 
 def near(data: PatchData, key: jax.Array, config: AutoencoderConfig) -> Places:

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.dynamics import along
 from vertiwm_jax.learning.dataset import Drives
+from vertiwm_jax.learning.objectives import teacher_forced
+from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import motion
@@ -39,35 +40,25 @@ def normalization(drives: Drives) -> Normalization:
 
 
 def nesam_constants(
-    nesam: Nesam,
-    params: VertiWMParams,
-    terrain: TerrainMap,
-    states: VehicleState,
-    commands: Command,
+    nesam: Nesam, params: VertiWMParams, terrain: TerrainMap, windows: Windows
 ) -> VertiWMParams:
-    """The parameters with NeSAM's `correction_scale` and `response`.
-
-    states: leaves `[N, T + 1, 3]` on the worlds `terrain.world` `[N]`; commands: leaves `[N, T]`.
-    """
+    """The parameters with NeSAM's `correction_scale` and `response`, measured on windows."""
     assert params.nesam is not None
     physics = params.nesam.physics(params.vehicle)
 
-    def one(
-        world: jax.Array, states: VehicleState, commands: Command
-    ) -> tuple[jax.Array, jax.Array]:
-        ground = terrain.select(world)
-        before, after = _before_and_after(states)
-        _, (proposed, memories) = along(
+    def one(window: Windows) -> tuple[jax.Array, jax.Array]:
+        ground = terrain.select(window.world)
+        before, _, after, (proposed, memories) = teacher_forced(
             Alone(nesam),
             params,
             ground,
-            before,
-            commands,
+            window,
             lambda history: (history.specialist.physics, history.specialist.simulator),
         )
         # The last but one memory goes with the last state.
         memory = jax.tree.map(lambda x: x[-2], memories)
-        start, command = jax.tree.map(lambda x: x[-1], (before, commands))
+        start = jax.tree.map(lambda x: x[-1], before)
+        command = Command.from_vector(window.control[-1])
 
         def answer(twist: jax.Array) -> jax.Array:
             moving = replace(start, velocity=twist[:3], angular_velocity=twist[3:])
@@ -79,7 +70,7 @@ def nesam_constants(
         above, below = jnp.split(jax.vmap(answer)(motion.twist(start) + nudges), 2)
         return jax.vmap(motion.difference)(proposed, after), (above - below).T / (2 * NUDGE)
 
-    missed, response = jax.vmap(one)(terrain.world, states, commands)
+    missed, response = jax.vmap(one)(windows)
     # A few crashes would make up most of the squares.
     missed = jnp.abs(missed.reshape(-1, 12))
     missed = jnp.minimum(missed, jnp.percentile(missed, 99.0, axis=0))
@@ -88,31 +79,21 @@ def nesam_constants(
 
 
 def gate_constants(
-    model: VertiWM,
-    params: VertiWMParams,
-    terrain: TerrainMap,
-    states: VehicleState,
-    commands: Command,
+    model: VertiWM, params: VertiWMParams, terrain: TerrainMap, windows: Windows
 ) -> VertiWMParams:
-    """The parameters with the constants of the gates' context; arguments as `nesam_constants`."""
+    """The parameters with the constants of the gates' context, measured on windows."""
     assert params.gate is not None
 
-    def one(world: jax.Array, states: VehicleState, commands: Command) -> jax.Array:
-        before, _ = _before_and_after(states)
-        ground = terrain.select(world)
-        return along(model, params, ground, before, commands, lambda history: history.context)[1]
+    def one(window: Windows) -> jax.Array:
+        ground = terrain.select(window.world)
+        return teacher_forced(model, params, ground, window, lambda history: history.context)[3]
 
-    context = jax.jit(jax.vmap(one))(terrain.world, states, commands)
+    context = jax.jit(jax.vmap(one))(windows)
     context = context.reshape(-1, context.shape[-1])
     deviation = jnp.std(context, axis=0)
     scale = jnp.where(deviation > _CONSTANT, 1 / jnp.maximum(deviation, _CONSTANT), 0.0)
     scale = scale.at[jnp.array(POSITION_AND_YAW)].set(0.0)
     return replace(params, gate=replace(params.gate, mean=jnp.mean(context, axis=0), scale=scale))
-
-
-def _before_and_after(states: VehicleState) -> tuple[VehicleState, VehicleState]:
-    before, after = slice(None, -1), slice(1, None)
-    return jax.tree.map(lambda x: x[before], states), jax.tree.map(lambda x: x[after], states)
 
 
 def _moments(values: np.ndarray) -> tuple[jax.Array, jax.Array]:

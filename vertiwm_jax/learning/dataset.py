@@ -106,7 +106,7 @@ def load_drives(
 
 
 def load_file(path: Path) -> tuple[Drives, TerrainMap]:
-    """All drives of one file, with its map; raises like `load`."""
+    """All drives of one file, with its map; raises like `load_drives`."""
     arrays, terrain = _read(path)
     world = np.zeros(len(arrays["length"]), np.int32)
     return _join([path], [{**arrays, "world": world}]), terrain
@@ -120,11 +120,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], TerrainMap]:
         wheels = np.asarray(meta["vehicle"]["wheels_in_body_xy"], np.float32)
         arrays["wheel_class"] = _look_up_classes(terrain, arrays["state"], wheels)
     schema.check_classes(path, arrays["wheel_class"], len(terrain.class_names))
-    return {
-        **arrays,
-        "length": arrays["length"].astype(np.int32),
-        "wheel_class": arrays["wheel_class"].astype(np.uint8),
-    }, terrain
+    kinds = {"length": np.int32, "wheel_class": np.uint8}
+    return arrays | {name: arrays[name].astype(kind) for name, kind in kinds.items()}, terrain
 
 
 def _look_up_classes(terrain: TerrainMap, state: np.ndarray, wheels: np.ndarray) -> np.ndarray:
@@ -144,19 +141,7 @@ def _join(paths: list[Path], parts: list[dict[str, np.ndarray]]) -> Drives:
                 f"{lacking[0]}: {name}: expected in all files that are loaded together or in "
                 f"none, missing in {len(lacking)} of {len(paths)}"
             )
-    steps = max(part["control"].shape[1] for part in parts)
-
-    def padded(name: str) -> np.ndarray:
-        arrays = [part[name] for part in parts]
-        if arrays[0].ndim > 1:
-            longest = steps if name == "control" else steps + 1
-            arrays = [
-                np.pad(a, [(0, 0), (0, longest - a.shape[1])] + [(0, 0)] * (a.ndim - 2), "edge")
-                for a in arrays
-            ]
-        return np.concatenate(arrays)
-
-    joined = {name: padded(name) for name in sorted(every)}
+    joined = schema.join(parts)
     signals = WheelSignals(
         **{name: joined.pop(name) for name in schema.WHEEL_SIGNALS if name in joined}
     )

@@ -101,9 +101,9 @@ def fit(
             expected = configuration.choices(name, known)
             raise ConfigError(f"{name}: unknown setting, expected {expected}")
     data = [drives] if isinstance(drives, str | Path) else drives
-    changed = settings | {"data": tuple(map(Path, data)), "runs": Path(runs)}
-    changed |= {"start": Path(start)} if start else {}
-    found = load_fitted(run(replace(chosen, **changed)) / "model")
+    settings |= {"data": tuple(map(Path, data)), "runs": Path(runs)}
+    settings |= {"start": Path(start)} if start else {}
+    found = load_fitted(run(replace(chosen, **settings)) / "model")
     return found.get("vertiwm") or next(iter(found.values()))
 
 

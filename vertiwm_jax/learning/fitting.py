@@ -53,7 +53,7 @@ class FitConfig:
     GONE: ClassVar[dict[str, str]] = {"accumulate": "is now grad_accumulation"}
 
     updates: CountOrZero = 10_000
-    """Optimiser steps (AdamW), each on a batch, or batches, of its own; 0 leaves the stage out."""
+    """Optimizer steps (AdamW), each on a batch, or batches, of its own; 0 leaves the stage out."""
     updates_per_iteration: Count = 100
     """Updates between two validations, in one compiled call."""
     grad_accumulation: Count = 1
@@ -103,7 +103,7 @@ class FitState:
     """
 
     trained: Params
-    optimiser: optax.OptState
+    optimizer: optax.OptState
     update: jax.Array
     key: jax.Array
     best: Params
@@ -126,7 +126,7 @@ class Fit(Algorithm[FitState]):
         trained = _pick(data.params, self.config.trainable)
         return FitState(
             trained=jax.tree.map(partial(jnp.array, copy=True), trained),
-            optimiser=self._optimiser.init(trained),
+            optimizer=self._optimizer.init(trained),
             update=jnp.int32(0),
             key=key,
             best=jax.tree.map(partial(jnp.array, copy=True), trained),
@@ -139,11 +139,9 @@ class Fit(Algorithm[FitState]):
         An update whose gradients are not finite is skipped. Metrics are means over the updates,
         the share that was `skipped`, and those of the validation.
         """
-        state, metrics = jax.lax.scan(
-            lambda state, _: self._update(data, state),
-            state,
-            length=self.config.updates_per_iteration,
-        )
+        updates = self.config.updates_per_iteration
+        update = partial(self._update, data)
+        state, metrics = jax.lax.scan(lambda state, _: update(state), state, length=updates)
         params = merge(data.params, state.trained)
         validated = self.problem.validate(params, data.data)
         error = validated["error"]
@@ -166,29 +164,18 @@ class Fit(Algorithm[FitState]):
             state.update * several + jnp.arange(several),
         )
         norm = optax.tree.norm(gradient)
-        updates, optimiser = self._optimiser.update(gradient, state.optimiser, state.trained)
-        metrics = {
-            "loss": value,
-            "gradient_norm": jnp.where(jnp.isfinite(norm), norm, jnp.nan),
-            "skipped": jnp.float32(~jnp.isfinite(norm)),
-        }
-        return replace(
-            state,
-            trained=optax.apply_updates(state.trained, updates),
-            optimiser=optimiser,
-            update=state.update + 1,
-        ), metrics
+        updates, optimizer = self._optimizer.update(gradient, state.optimizer, state.trained)
+        trained, finite = optax.apply_updates(state.trained, updates), jnp.isfinite(norm)
+        state = replace(state, trained=trained, optimizer=optimizer, update=state.update + 1)
+        norm, skipped = jnp.where(finite, norm, jnp.nan), jnp.float32(~finite)
+        return state, {"loss": value, "gradient_norm": norm, "skipped": skipped}
 
     @property
-    def _optimiser(self) -> optax.GradientTransformation:
+    def _optimizer(self) -> optax.GradientTransformation:
         config = self.config
-        rate = optax.warmup_cosine_decay_schedule(
-            0.0,
-            config.learning_rate,
-            config.warm_up,
-            config.updates,
-            LAST_LEARNING_RATE * config.learning_rate,
-        )
+        highest, last = config.learning_rate, LAST_LEARNING_RATE * config.learning_rate
+        lengths = config.warm_up, config.updates
+        rate = optax.warmup_cosine_decay_schedule(0.0, highest, *lengths, last)
         descent = optax.chain(
             optax.clip_by_global_norm(config.max_gradient_norm),
             optax.adamw(rate, b2=SECOND_MOMENT, weight_decay=config.weight_decay),

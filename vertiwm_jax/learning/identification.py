@@ -3,11 +3,14 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from functools import partial
+from operator import mul
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import least_squares
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax.config import ConfigError
@@ -24,10 +27,8 @@ from vertiwm_jax.terrain.map import TerrainMap
 FREE = ("speed_gain", "wheel_torque", "brake_torque", "tyre_friction")
 _CONTEXT = 8  # steps that settle the springs
 _MOST_WINDOWS = 512
-_ITERATIONS = 6
-_STEP = 0.02  # of a logarithm, for differences
-_LARGEST = 0.5  # of a logarithm, in one iteration
-_PRIOR = 1e-3  # how much the numbers that are given count, beside the share of all windows
+_MOST_TRIES = 12
+_STEP = 0.02  # share by which numbers are changed to see what they do
 _log = logging.getLogger(__name__)
 
 
@@ -40,8 +41,8 @@ def identify(
 ) -> VehicleConfig:
     """Finds numbers of a vehicle with which the simulator predicts its drives best.
 
-    Each number is multiplied by a factor, which damped Gauss-Newton steps find. What drives tell
-    nothing of stays as it is. Progress is logged.
+    Each number is multiplied by a factor, which nonlinear least squares find. Windows with a crash
+    count little (Cauchy's loss), and what drives tell nothing of stays as it is.
 
     Args:
         drives: a folder of drives, as `load_drives` reads them, or several.
@@ -65,34 +66,37 @@ def identify(
     recorded, terrain = load_drives(drives, "train")
     index = windows.index(recorded, terrain, _CONTEXT, horizon, horizon)
     every = -(-len(index.start) // _MOST_WINDOWS)
-    chosen = windows.gather(recorded, jax.tree.map(lambda x: x[::every], index))
+    chosen = windows.gather(recorded, index, np.arange(0, len(index.start), every))
+
+    def changed(factors: np.ndarray) -> VehicleConfig:
+        each = zip(free, factors.tolist(), strict=True)
+        found = {name: jax.tree.map(partial(mul, by), getattr(begin, name)) for name, by in each}
+        return replace(begin, **found)
 
     def misses(factors: np.ndarray) -> np.ndarray:
-        params = chrono_like(_changed(begin, free, factors).vehicle)
-        return np.asarray(_misses(params, terrain, chosen))
+        params = chrono_like(changed(factors).vehicle)
+        return np.asarray(_misses(params, terrain, chosen), float).ravel()
 
-    factors = np.zeros(len(free))
-    found = misses(factors)
-    scale = float(np.median(np.abs(found))) + 1e-6
-    _log.info("the simulator errs by %.3f m after %d steps", _error(found), horizon)
-    for _ in range(_ITERATIONS):
-        shifted = [misses(factors + _STEP * row) for row in np.eye(len(free))]
-        slopes = np.stack([(other - found).ravel() for other in shifted], axis=1) / _STEP
-        # As Cauchy's loss weighs them, so that windows with a crash count little.
-        weight = 1 / (1 + (found.ravel() / scale) ** 2)
-        curvature = slopes.T @ (weight[:, None] * slopes)
-        damping = _PRIOR * (np.trace(curvature) / len(free) + 1e-9) * np.eye(len(free))
-        step = np.linalg.solve(curvature + damping, -slopes.T @ (weight * found.ravel()))
-        step = np.clip(step, -_LARGEST, _LARGEST)
-        for half in (1.0, 0.5, 0.25):
-            tried = misses(factors + half * step)
-            if _loss(tried, scale) < _loss(found, scale):
-                factors, found = factors + half * step, tried
-                break
-        else:
-            break
-        _log.info("  %.3f m: %s", _error(found), _told(_changed(begin, free, factors), free))
-    return _changed(begin, free, factors)
+    def error(missed: np.ndarray) -> float:
+        return float(np.linalg.norm(missed.reshape(-1, 4)[:, :3], axis=1).mean())
+
+    missed = misses(np.ones(len(free)))
+    _log.info("the simulator errs by %.3f m after %d steps", error(missed), horizon)
+    fitted = least_squares(
+        misses,
+        np.ones(len(free)),
+        bounds=(0, np.inf),
+        loss="cauchy",
+        f_scale=float(np.median(np.abs(missed))) + 1e-6,
+        diff_step=_STEP,
+        xtol=1e-3,
+        ftol=1e-4,
+        max_nfev=_MOST_TRIES,
+    )
+    found = changed(fitted.x)
+    told = ", ".join(f"{name} {np.round(getattr(found, name), 4)}" for name in free)
+    _log.info("  %.3f m: %s", error(fitted.fun), told)
+    return found
 
 
 @jax.jit
@@ -101,32 +105,10 @@ def _misses(params: SimulatorParams, terrain: TerrainMap, chosen: Windows) -> ja
 
     def one(window: Windows) -> jax.Array:
         ground = terrain.select(window.world)
-        states, _ = open_loop(Simulator(), params, ground, window, lambda _: None)
+        states, _ = open_loop(Simulator(), params, ground, window)
         truth = window.state[-1]
         turn = wrap(states.rpy[-1, 2] - truth[5]) * params.vehicle.wheelbase
         return jnp.append(states.position[-1] - truth[:3], turn)
 
     missed = jax.lax.map(one, chosen, batch_size=64)
     return jnp.nan_to_num(missed, nan=1e3, posinf=1e3, neginf=-1e3)
-
-
-def _changed(begin: VehicleConfig, free: Sequence[str], factors: np.ndarray) -> VehicleConfig:
-    def times(value: float | tuple[float, ...], factor: float) -> float | tuple[float, ...]:
-        if isinstance(value, tuple):
-            return tuple(factor * x for x in value)
-        return factor * value
-
-    grown = zip(free, np.exp(factors).tolist(), strict=True)
-    return replace(begin, **{name: times(getattr(begin, name), factor) for name, factor in grown})
-
-
-def _loss(missed: np.ndarray, scale: float) -> float:
-    return float(np.log1p((missed / scale) ** 2).sum())
-
-
-def _error(missed: np.ndarray) -> float:
-    return float(np.linalg.norm(missed[:, :3], axis=1).mean())
-
-
-def _told(found: VehicleConfig, free: Sequence[str]) -> str:
-    return ", ".join(f"{name} {np.round(getattr(found, name), 4)}" for name in free)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +16,8 @@ from vertiwm_jax.terrain.map import TerrainMap
 T = TypeVar("T")
 
 
-class Objective(Protocol):
-    """The loss of one window, its leaves without the axis N, on its own world."""
-
-    def __call__(self, params: Params, terrain: TerrainMap, window: Windows) -> jax.Array: ...
+Objective = Callable[[Params, TerrainMap, Windows], jax.Array]
+"""The loss `[]` of one window, its leaves without the axis N, on its own world."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +49,27 @@ class TeacherForcingLoss:
     deviation: tuple[float, ...]
 
     def __call__(self, params: Params, terrain: TerrainMap, window: Windows) -> jax.Array:
-        recorded = VehicleState.from_vector(window.state)
-        before, after = _at(recorded, slice(None, -1)), _at(recorded, slice(1, None))
-        commands = Command.from_vector(window.control)
-        predicted, _ = along(self.dynamics, params, terrain, before, commands)
+        before, predicted, after, _ = teacher_forced(self.dynamics, params, terrain, window)
         return jnp.mean(step_loss(jnp.asarray(self.deviation), before, predicted, after))
+
+
+def teacher_forced(
+    dynamics: Dynamics,
+    params: Params,
+    terrain: TerrainMap,
+    window: Windows,
+    read: Callable[[History], Any] = lambda _: None,
+) -> tuple[VehicleState, VehicleState, VehicleState, Any]:
+    """Single steps along one window, each from the recorded state.
+
+    Returns:
+        Where the C + K steps begin, where the model goes, and where the drive went, leaves
+        `[C + K, 3]`; and what is read of the histories after the steps.
+    """
+    before, after = map(VehicleState.from_vector, (window.state[:-1], window.state[1:]))
+    commands = Command.from_vector(window.control)
+    predicted, found = along(dynamics, params, terrain, before, commands, read)
+    return before, predicted, after, found
 
 
 def open_loop(
@@ -63,17 +77,16 @@ def open_loop(
     params: Params,
     terrain: TerrainMap,
     window: Windows,
-    read: Callable[[History], T],
+    read: Callable[[History], T] = lambda _: None,
 ) -> tuple[VehicleState, T]:
     """The K states predicted in one window, leaves `[K, 3]`, and what is read of the histories.
 
     The history is warmed up on the recorded context; from its last state on, the model sees its
     own predictions and the recorded commands. No gradient flows into the context.
     """
-    c = window.context
-    recorded, commands = VehicleState.from_vector(window.state), Command.from_vector(window.control)
-    context, start = _at(recorded, slice(c + 1)), _at(recorded, c)
-    history = warm_up(dynamics, params, terrain, context, _at(commands, slice(c)))
+    c, commands = window.context, Command.from_vector
+    context, start = map(VehicleState.from_vector, (window.state[: c + 1], window.state[c]))
+    history = warm_up(dynamics, params, terrain, context, commands(window.control[:c]))
 
     def advance(
         carry: tuple[VehicleState, History], command: Command
@@ -82,8 +95,4 @@ def open_loop(
         return (state, history), (state, read(history))
 
     history = jax.lax.stop_gradient(history)
-    return jax.lax.scan(advance, (start, history), _at(commands, slice(c, None)))[1]
-
-
-def _at(tree: T, place: int | slice) -> T:
-    return jax.tree.map(lambda x: x[place], tree)
+    return jax.lax.scan(advance, (start, history), commands(window.control[c:]))[1]

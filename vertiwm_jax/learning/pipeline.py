@@ -3,11 +3,11 @@
 Every stage is a `stages.fit` in a folder of its own inside that of the run.
 """
 
-import operator
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -17,21 +17,20 @@ import numpy as np
 from vertiwm_jax.config import settings
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning import autoencoders, calibration, dataset, stages, windows
-from vertiwm_jax.learning.autoencoders import AutoencoderConfig, AutoencoderProblem, PatchData
 from vertiwm_jax.learning.dataset import Drives, Split, WheelSignals
 from vertiwm_jax.learning.fitting import FitConfig, Problem
 from vertiwm_jax.learning.losses import LossConfig
 from vertiwm_jax.learning.objectives import RolloutLoss, TeacherForcingLoss
 from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
 from vertiwm_jax.learning.schema import DataError
-from vertiwm_jax.learning.soils import SoilProblem
 from vertiwm_jax.learning.stages import Inputs
+from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import VehicleConfig, load_vehicle
 from vertiwm_jax.models.config import ModelConfig, with_soil
+from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.runs import Run
-from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.alone import Alone
 from vertiwm_jax.world_model.verti_wm import VertiWMParams
@@ -39,6 +38,9 @@ from vertiwm_jax.world_model.verti_wm import VertiWMParams
 Kind = Literal["rigid", "deformable", "mixed"]
 KINDS: tuple[Kind, ...] = ("rigid", "deformable", "mixed")
 """Collections of drives, by the ground of their worlds; also the names of their folders."""
+Specialist = Literal["transformer", "nesam"]
+_PAIR: dict[Specialist, int] = {"transformer": 0, "nesam": -1}
+"""Which pair of encoders a specialist sees by; they may be the same."""
 SAMPLE = 512
 """Windows on which the constants of a model are measured before it learns."""
 
@@ -56,15 +58,10 @@ class SpecialistConfig:
     rollouts: FitConfig = FitConfig()
     """Open loop, as it will be used."""
 
-    @classmethod
-    def of(cls, *trainable: str) -> Self:
-        """One of which these parameters are trained."""
-        base = cls()
-        return replace(
-            base,
-            single_steps=replace(base.single_steps, trainable=trainable),
-            rollouts=replace(base.rollouts, trainable=trainable),
-        )
+    def training(self, *names: str) -> Self:
+        """The same, of which these parameters are trained."""
+        stages = {name: getattr(self, name) for name in ("single_steps", "rollouts")}
+        return replace(self, **{k: replace(stage, trainable=names) for k, stage in stages.items()})
 
 
 @dataclass(frozen=True)
@@ -90,11 +87,13 @@ class PipelineConfig:
     """Which windows of the drives."""
     loss: LossConfig = LossConfig(velocity=0.05)
     """Of predictions."""
-    patches: AutoencoderConfig = AutoencoderConfig()
+    patches: autoencoders.AutoencoderConfig = autoencoders.AutoencoderConfig()
     """Which patches of the ground, for autoencoders and soil predictor."""
-    transformer: SpecialistConfig = SpecialistConfig.of("transformer.network", "encoders.0.reduce")
+    transformer: SpecialistConfig = SpecialistConfig().training(
+        "transformer.network", "encoders.0.reduce"
+    )
     """The specialist for rigid ground."""
-    nesam: SpecialistConfig = SpecialistConfig.of("nesam.network")
+    nesam: SpecialistConfig = SpecialistConfig().training("nesam.network")
     """The specialist for soil."""
     soil: FitConfig = FitConfig(updates=2000, weight_decay=0.0, trainable=("soil",))
     """The soil predictor."""
@@ -131,62 +130,73 @@ def fit(
     reuse: Sequence[Path] = (),
     start: VertiWMParams | None = None,
 ) -> VertiWMParams:
-    """All stages of the configured parts; gives their parameters, and others untrained.
+    """Runs all stages of the configured parts.
 
-    folders: of drives, or of folders of drives named like `KINDS`; reuse: of other runs, whose
-    stages are taken over where their inputs are the same; start: parameters to go on from, by
-    open-loop predictions alone. Raises what `load_drives`, `WindowData.of` and `fitting.fit`
-    raise.
+    Args:
+        config: what is fitted, and how.
+        folders: of drives, or of folders of drives named like `KINDS`.
+        key: of all that is random.
+        run: in whose folder the stages are.
+        reuse: folders of other runs, whose stages are taken over where their inputs are the same.
+        start: parameters to go on from, by open-loop predictions alone.
+
+    Returns:
+        The parameters; those of parts that are not configured are untrained.
+
+    Raises:
+        DataError, MapError, ConfigError: of `load_drives`, `WindowData.of` and `fitting.fit`.
     """
     driven = config.driven
-    if start is not None and driven is not None:
-        start = replace(start, vehicle=jax.device_put(driven.vehicle))
-    pipeline = _Pipeline(config, tuple(folders), key, run, tuple(reuse), start)
-    model, parts = config.model, config.model.parts
+    begun = () if driven is None else (str(driven),)
+    if start is not None:
+        start = start if driven is None else replace(start, vehicle=jax.device_put(driven.vehicle))
+        begun = (stages.digest(start),)
+    pipeline = _Pipeline(config, folders, key, run, reuse, begun, from_nothing=start is None)
     if start is None:
         constants = calibration.normalization(pipeline.load(KINDS, "train")[0])
         physics = chrono_like(driven.vehicle if driven else load_vehicle())
-        params = model.init_params(key, physics, constants)
+        params = config.model.init_params(key, physics, constants)
     else:
-        params = model.with_gates(start, key)
+        params = config.model.with_gates(start, key)
     digests: list[str] = []
     for name in ("nesam", "transformer"):
-        if name in parts:
+        if name in config.model.parts:
             params, digest = pipeline.specialist(name, params)
             digests.append(digest)
-    return pipeline.gate(params, digests) if "gate" in parts else params
+    return pipeline.gate(params, digests) if "gate" in config.model.parts else params
 
 
 @dataclass(frozen=True)
 class _Pipeline:
-    """What its stages share; `loaded` are the drives that were read so far."""
+    """What the stages of a fit share.
+
+    begun: what is known of the parameters that it begins with; loaded: drives that were read.
+    """
 
     config: PipelineConfig
-    folders: tuple[Path, ...]
+    folders: Sequence[Path]
     key: jax.Array
     run: Run
-    reuse: tuple[Path, ...]
-    start: VertiWMParams | None
+    reuse: Sequence[Path]
+    begun: tuple[str, ...]
+    from_nothing: bool
     loaded: dict[Any, tuple[Drives, TerrainMap]] = field(default_factory=dict)
 
-    def specialist(
-        self, name: Literal["transformer", "nesam"], params: VertiWMParams
-    ) -> tuple[VertiWMParams, str]:
+    def specialist(self, name: Specialist, params: VertiWMParams) -> tuple[VertiWMParams, str]:
         """The parameters with one specialist fitted, and the digest of its last stage.
 
         First its encoders, then for NeSAM what soils look like, then how it moves.
         """
         model, config = self.config.model, getattr(self.config, name)
-        kinds, before = config.learns_from, self._begun
+        kinds, before, digest = config.learns_from, self.begun, ""
         sees = name == "nesam" or model.terrain == "patches"
-        if self.start is None and sees:
-            params, before = self._encoders(name, params)
-        soil = params.encoders[-1].soil
-        if model.soil == "map":
-            params = with_soil(params, None)
-        if self.start is None and name == "nesam":
+        if self.from_nothing and sees:
+            params, digests = self._encoders(name, params)
+            before = *digests, *before
+        if self.from_nothing and name == "nesam":
             sample = self._sample(kinds)
-            params = calibration.nesam_constants(model.nesam, params, *sample)
+            measured = calibration.nesam_constants(model.nesam, self._on_its_soil(params), *sample)
+            params = replace(params, nesam=measured.nesam)
 
         # What is learned of `Encoders.reduce` is learned from latents.
         alone = Alone(model.nesam) if name == "nesam" else Alone(model.transformer, sees)
@@ -198,14 +208,11 @@ class _Pipeline:
             ("rollouts", RolloutLoss(alone, self.config.loss), config.rollouts),
         ]
         # A stage holds what is its specialist's alone, so that other runs may take it over.
-        at = 0 if name == "transformer" else len(params.encoders) - 1
-        encoders = params.encoders[at : at + 1]
-        if name == "transformer":
-            encoders = tuple(replace(pair, soil=None) for pair in encoders)
-        others = {"transformer": None, "nesam": None, "gate": None}
-        fitted = replace(params, **{**others, name: own}, encoders=encoders)
-        data, digest = self._windows(kinds), ""
-        for part, objective, schedule in parts if self.start is None else parts[1:]:
+        pair = self._on_its_soil(params).encoders[_PAIR[name]]
+        pair = replace(pair, soil=None) if name == "transformer" else pair
+        fitted = replace(VertiWMParams((pair,), params.vehicle), **{name: own})
+        data = self._windows(kinds)
+        for part, objective, schedule in parts if self.from_nothing else parts[1:]:
             if not sees:
                 trainable = [each for each in schedule.trainable if not each.startswith("encoders")]
                 schedule = replace(schedule, trainable=tuple(trainable))
@@ -213,35 +220,33 @@ class _Pipeline:
             stage = f"{name}_{part}", problem, schedule, kinds
             fitted, digest = self._fit(*stage, fitted, data, before)
             before = (digest,)
-        pairs = zip(fitted.encoders, params.encoders[at : at + 1], strict=True)
-        learned = [replace(pair, soil=pair.soil or old.soil) for pair, old in pairs]
-        encoders = (*params.encoders[:at], *learned, *params.encoders[at + 1 :])
-        params = replace(params, **{name: getattr(fitted, name)}, encoders=encoders)
-        return with_soil(params, soil), digest
+        (learned,) = fitted.encoders
+        learned = replace(learned, soil=learned.soil or params.encoders[_PAIR[name]].soil)
+        params = replace(params, **{name: getattr(fitted, name)})
+        return _with_pair(params, name, learned), digest
 
     def _encoders(
-        self, name: Literal["transformer", "nesam"], params: VertiWMParams
+        self, name: Specialist, params: VertiWMParams
     ) -> tuple[VertiWMParams, tuple[str, ...]]:
         """The parameters with the encoders of a specialist, and the digests of these stages."""
-        config = getattr(self.config, name)
-        kinds, patches = config.learns_from, self.config.patches
-        places = cache(lambda: PatchData.of(patches, *self._drives(kinds)))
-        seeing, schedule = name, config.autoencoders
-        if self.config.model.encoders == "shared":
-            seeing, schedule = "transformer", self.config.transformer.autoencoders
-        problem = AutoencoderProblem(patches)
+        kinds, patches = getattr(self.config, name).learns_from, self.config.patches
+        places = cache(lambda: autoencoders.PatchData.of(patches, *self._drives(kinds)))
+        seeing = "transformer" if self.config.model.encoders == "shared" else name
+        problem, schedule = (
+            autoencoders.AutoencoderProblem(patches),
+            getattr(self.config, seeing).autoencoders,
+        )
         pair = problem.init_params(self._key(seeing))
         stage = f"{seeing}_autoencoders", problem, schedule, kinds
         pair, digest = self._fit(*stage, pair, places)
-        before, at = (digest,), 0 if name == "transformer" else len(params.encoders) - 1
-        found = replace(params.encoders[at], **autoencoders.encoders(pair))
+        digests = (digest,)
+        found = replace(params.encoders[_PAIR[name]], **autoencoders.encoders(pair))
         if name == "nesam":
             looks = {"semantic": found.semantic, "soil": found.soil}
-            stage = f"{name}_soil", SoilProblem(patches), self.config.soil, kinds
-            looks, digest = self._fit(*stage, looks, places, before)
-            before, found = (*before, digest), replace(found, soil=looks["soil"])
-        encoders = (*params.encoders[:at], found, *params.encoders[at + 1 :])
-        return replace(params, encoders=encoders), before
+            stage = f"{name}_soil", autoencoders.SoilProblem(patches), self.config.soil, kinds
+            looks, digest = self._fit(*stage, looks, places, digests)
+            digests, found = (*digests, digest), replace(found, soil=looks["soil"])
+        return _with_pair(params, name, found), digests
 
     def gate(self, params: VertiWMParams, before: Sequence[str]) -> VertiWMParams:
         """The gates between two specialists, whose digests are given."""
@@ -249,13 +254,11 @@ class _Pipeline:
         learned = config.rollouts.trainable
         latents = not learned or any(name.startswith("encoders") for name in learned)
         verti_wm = replace(self.config.model.verti_wm, latents=latents)
-        if self.config.model.soil == "map":
-            params = with_soil(params, None)
-        if self.start is None:
+        params = self._on_its_soil(params)
+        if self.from_nothing:
             sample = self._sample(config.learns_from)
             params = calibration.gate_constants(verti_wm, params, *sample)
-        read = operator.attrgetter("coefficients")
-        objective = RolloutLoss(verti_wm, self.config.loss, read)
+        objective = RolloutLoss(verti_wm, self.config.loss, attrgetter("coefficients"))
         problem = WindowProblem(verti_wm, objective, self.config.windows)
         data = self._windows(config.learns_from)
         schedule = problem, config.rollouts, config.learns_from
@@ -267,6 +270,10 @@ class _Pipeline:
             fitted.append(self._fit(name, *schedule, alone, data, before)[0])
         gates = [each.gate for each in fitted if each.gate is not None]
         return with_soil(replace(fitted[0], gate=gates[0].beside(*gates[1:])), soil)
+
+    def _on_its_soil(self, params: VertiWMParams) -> VertiWMParams:
+        """The parameters without a soil predictor, if the model takes the soils of the map."""
+        return with_soil(params, None) if self.config.model.soil == "map" else params
 
     def _fit(
         self,
@@ -286,14 +293,6 @@ class _Pipeline:
         inputs = Inputs(problem, config, seed, tuple(kinds), drives, tuple(before))
         fitted = stages.fit(self.run, name, inputs, params, data, key, self.reuse)
         return fitted, inputs.digest
-
-    @property
-    def _begun(self) -> tuple[str, ...]:
-        """What the first stages know the parameters by that they go on from."""
-        if self.start is not None:
-            return (stages.digest(self.start),)
-        driven = self.config.driven
-        return () if driven is None else (str(driven),)
 
     def _key(self, name: str) -> jax.Array:
         return jax.random.fold_in(self.key, zlib.crc32(name.encode()))
@@ -327,12 +326,17 @@ class _Pipeline:
             )
         return chosen
 
-    def _sample(self, kinds: Sequence[Kind]) -> tuple[TerrainMap, VehicleState, Command]:
-        """Some windows of the training drives as a measurement takes them, each on its world."""
+    def _sample(self, kinds: Sequence[Kind]) -> tuple[TerrainMap, Windows]:
+        """Some windows of the training drives, as a measurement takes them, and their ground."""
         recorded, terrain = self.load(kinds, "train")
         config = self.config.windows
         index = windows.index(recorded, terrain, config.context, config.horizon, config.stride)
         rows = np.linspace(0, len(index.drive) - 1, SAMPLE).astype(int)
-        some = windows.gather(recorded, jax.tree.map(lambda x: x[rows], index))
-        states = VehicleState.from_vector(some.state)
-        return terrain.select(some.world), states, Command.from_vector(some.control)
+        return terrain, windows.gather(recorded, index, rows)
+
+
+def _with_pair(params: VertiWMParams, name: Specialist, pair: Encoders) -> VertiWMParams:
+    """The parameters with other encoders of a specialist."""
+    encoders = list(params.encoders)
+    encoders[_PAIR[name]] = pair
+    return replace(params, encoders=tuple(encoders))

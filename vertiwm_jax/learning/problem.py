@@ -1,7 +1,7 @@
 """Windows of recorded drives as what a model is fitted to and validated on."""
 
 from dataclasses import dataclass
-from typing import Any, Self, TypeVar
+from typing import Self
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +16,6 @@ from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.learning.objectives import Objective, open_loop
 from vertiwm_jax.learning.windows import GROUNDS, WindowIndex, Windows
 from vertiwm_jax.terrain.map import TerrainMap
-
-T = TypeVar("T")
 
 
 @settings
@@ -80,7 +78,7 @@ class WindowData:
             index=index,
             share=jnp.asarray(chance / chance[-1], jnp.float32),
             terrain=augment.with_mirrored(terrain) if config.mirror else terrain,
-            validation=windows.gather(validation[0], _at(held_out, rows)),
+            validation=windows.gather(validation[0], held_out, rows),
             validation_terrain=validation[1],
         )
 
@@ -106,7 +104,7 @@ class WindowProblem:
         draw_key, mirror_key = jax.random.split(key)
         uniform = jax.random.uniform(draw_key, (self.config.batch,))
         rows = jnp.searchsorted(data.share, uniform, side="right")
-        batch = windows.gather(data.drives, _at(data.index, rows))
+        batch = windows.gather(data.drives, data.index, rows)
         if self.config.mirror:
             batch = augment.mirror_some(mirror_key, batch, data.terrain)
 
@@ -122,7 +120,7 @@ class WindowProblem:
             params: Params, terrain: TerrainMap, window: Windows
         ) -> tuple[jax.Array, jax.Array]:
             terrain = terrain.select(window.world)
-            predicted, _ = open_loop(self.dynamics, params, terrain, window, lambda _: None)
+            predicted, _ = open_loop(self.dynamics, params, terrain, window)
             truth, start = window.state[-1, :3], window.state[window.context, :3]
             error = jnp.linalg.norm(predicted.position[-1] - truth)
             lost = ~jnp.isfinite(error)
@@ -134,11 +132,6 @@ class WindowProblem:
         means = jnp.sum(kinds * error, axis=1) / jnp.sum(kinds, axis=1)
         by_kind = {f"error_{kind}": mean for kind, mean in zip(GROUNDS, means, strict=True)}
         return {**by_kind, "error": jnp.nanmean(means), "diverged": jnp.mean(lost)}
-
-
-def _at(tree: T, place: Any) -> T:
-    """A pytree with every leaf indexed."""
-    return jax.tree.map(lambda x: x[place], tree)
 
 
 def _spread(ground: np.ndarray, most: int) -> np.ndarray:

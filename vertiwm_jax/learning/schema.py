@@ -34,35 +34,36 @@ from vertiwm_jax import atomic
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.state import STEP_SECONDS
 
-_REQUIRED = {
-    "state": ("K", "T + 1", 12),
-    "control": ("K", "T", 2),
-    "length": ("K",),
-}
 WHEEL_SIGNALS = {
-    "wheel_omega": ("K", "T + 1", 4),
-    "wheel_sinkage": ("K", "T + 1", 4),
-    "wheel_force": ("K", "T + 1", 4, 3),
-    "chassis_force": ("K", "T + 1", 3),
-    "steer_angle": ("K", "T + 1", 2),
+    "wheel_omega": (4,),
+    "wheel_sinkage": (4,),
+    "wheel_force": (4, 3),
+    "chassis_force": (3,),
+    "steer_angle": (2,),
 }
-"""Shapes of what may be recorded beside the states."""
-_SHAPES = {**_REQUIRED, "wheel_class": ("K", "T + 1", 4), **WHEEL_SIGNALS}
-_FLOATS = ("state", "control", *WHEEL_SIGNALS)
-
-_LARGEST = {
-    "wheel_omega": (1e3, "wheel speed in rad/s"),
-    "wheel_sinkage": (10.0, "depth in m"),
-    "wheel_force": (1e6, "force in N"),
-    "chassis_force": (1e6, "force in N"),
-    "steer_angle": (np.pi / 2, "wheel angle in rad"),
-}
-_LARGEST_SPEED = 50.0
-_LARGEST_COORDINATE = 1e5
+"""What may be recorded beside the states, and its shape at one moment."""
+_REQUIRED = {"state": (12,), "control": (2,), "length": ()}
+_SHAPES = {**_REQUIRED, "wheel_class": (4,), **WHEEL_SIGNALS}
+_ALL = slice(None)
+_LIMITS = (
+    ("state", slice(0, 3), 1e5, "position in m"),
+    ("state", slice(3, 6), 2 * np.pi, "roll, pitch and yaw in rad"),
+    ("state", slice(6, 9), 50.0, "velocity in m/s"),
+    ("state", slice(9, 12), 10 * np.pi, "angular velocity in rad/s"),
+    ("control", 0, 50.0, "commanded speed in m/s"),
+    ("control", 1, np.pi / 2, "front-wheel angle in rad"),
+    ("wheel_omega", _ALL, 1e3, "wheel speed in rad/s"),
+    ("wheel_sinkage", _ALL, 10.0, "depth in m"),
+    ("wheel_force", _ALL, 1e6, "force in N"),
+    ("chassis_force", _ALL, 1e6, "force in N"),
+    ("steer_angle", _ALL, np.pi / 2, "wheel angle in rad"),
+)
+"""Array, columns, largest absolute value and meaning: degrees, millimeters and km/h lie beyond."""
+_FLOATS = tuple(dict.fromkeys(name for name, *_ in _LIMITS))
 _MOVING = 1.0
 """Speed, m/s, above which the distance of a step is compared with it."""
 _TRAVEL = (0.6, 1.6)
-"""Bounds of that ratio: another sampling rate, km/h or centimetres lie beyond."""
+"""Bounds of that ratio: another sampling rate, km/h or centimeters lie beyond."""
 
 
 class DataError(UserError, ValueError):
@@ -70,44 +71,48 @@ class DataError(UserError, ValueError):
 
 
 def read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays that a file has of the schema, in float32, and its meta.
+    """The arrays of a file that the schema names, numbers in float32, and its meta.
 
     Raises `DataError` unless all of it can be used. Class ids need the map: see `check_classes`.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
-            missing = [name for name in (*_REQUIRED, "meta") if name not in archive]
-            if missing:
-                raise DataError(f"{path}: missing {', '.join(missing)}; found {archive.files}")
-            arrays = {name: archive[name] for name in _SHAPES if name in archive}
-            meta = str(archive["meta"])
-    except DataError:
-        raise
+            found = {name: archive[name] for name in (*_SHAPES, "meta") if name in archive}
     except Exception as error:  # Zip, codecs and NumPy's header parser each have their own.
         raise DataError(f"{path}: expected an .npz archive of plain arrays: {error}") from error
-    arrays = check(path, arrays)
-    return arrays, _parse(path, meta, "wheel_class" in arrays)
+    missing = [name for name in (*_REQUIRED, "meta") if name not in found]
+    if missing:
+        raise DataError(f"{path}: missing {', '.join(missing)}; found {list(found)}")
+    meta = str(found.pop("meta"))
+    return check(path, found), _parse(path, meta, "wheel_class" in found)
 
 
-def join(
-    drives: Sequence[Mapping[str, np.ndarray]], steps: int | None = None
-) -> dict[str, np.ndarray]:
-    """K drives as arrays of the schema, each filled up with its last values.
+def drive(state: np.ndarray, control: np.ndarray, **others: np.ndarray) -> dict[str, np.ndarray]:
+    """One drive as arrays of the schema, K = 1.
 
-    drives: by name, `[T + 1, ...]`, and "control" `[T, 2]`. steps: how long they become; by
-    default as long as the longest.
+    state: `[T + 1, 12]`; control: `[T, 2]`; others: by name, `[T + 1, ...]`.
     """
-    length = np.array([len(drive["control"]) for drive in drives], np.int32)
-    steps = int(length.max()) if steps is None else steps
+    arrays = {"state": state, "control": control, **others}
+    kinds = {name: np.float32 for name in _FLOATS}
+    found = {name: x[None].astype(kinds.get(name, x.dtype)) for name, x in arrays.items()}
+    return {**found, "length": np.array([len(control)], np.int32)}
+
+
+def join(parts: Sequence[Mapping[str, np.ndarray]], steps: int = 0) -> dict[str, np.ndarray]:
+    """The drives of all parts one after the other, each filled up with its last values.
+
+    parts: arrays of the schema, of the same names, and others `[K]`. steps: how long drives become
+    at least; they become as long as the longest.
+    """
+    steps = max(steps, *(part["control"].shape[1] for part in parts))
 
     def filled(name: str, array: np.ndarray) -> np.ndarray:
-        missing = steps + (name != "control") - len(array)
-        array = array.astype(np.float32) if name in _FLOATS else array
-        return np.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1), "edge")
+        if array.ndim == 1:
+            return array
+        missing = steps + (name != "control") - array.shape[1]
+        return np.pad(array, [(0, 0), (0, missing)] + [(0, 0)] * (array.ndim - 2), "edge")
 
-    names = drives[0]
-    found = {name: np.stack([filled(name, drive[name]) for drive in drives]) for name in names}
-    return {**found, "length": length}
+    return {name: np.concatenate([filled(name, part[name]) for part in parts]) for name in parts[0]}
 
 
 def write(
@@ -123,14 +128,6 @@ def write(
     stored: dict[str, Any] = {**arrays, "meta": np.array(text)}
     np.savez_compressed(stream, **stored)
     atomic.write(path, stream.getvalue())
-
-
-def check(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Arrays of the schema in float32; raises `DataError`, which names `path`, unless all fit."""
-    _check_shapes(path, arrays)
-    arrays = arrays | {name: arrays[name].astype(np.float32) for name in _FLOATS if name in arrays}
-    _check_values(path, arrays)
-    return arrays
 
 
 def check_classes(path: Path, wheel_class: np.ndarray, classes: int) -> None:
@@ -150,6 +147,57 @@ def find_map(path: Path, name: str) -> Path:
         if place.is_file():
             return place
     raise DataError(f"{path}: meta: its map {name} was expected at {places[0]} or {places[1]}")
+
+
+def check(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Arrays of the schema, numbers in float32; raises `DataError`, which names `path`.
+
+    They have to be of the right shape, finite where they are valid, and in SI units.
+    """
+    if arrays["control"].ndim != 3:
+        found = list(arrays["control"].shape)
+        raise DataError(f"{path}: control: expected shape [K, T, 2], found {found}")
+    drives, steps, _ = arrays["control"].shape
+    for name, array in arrays.items():
+        axes = {"length": (), "control": (steps,)}.get(name, (steps + 1,))
+        wanted = (drives, *axes, *_SHAPES[name])
+        if array.shape != wanted:
+            raise DataError(
+                f"{path}: {name}: expected shape {list(wanted)} (K and T as in control), "
+                f"found {list(array.shape)}"
+            )
+        if name in _FLOATS and array.dtype.kind not in "fiu":
+            raise DataError(f"{path}: {name}: expected numbers, found dtype {array.dtype}")
+    if not (drives and steps):
+        raise DataError(
+            f"{path}: control: expected one drive or more, of one step or more, "
+            f"found shape {[drives, steps, 2]}"
+        )
+    length = arrays["length"]
+    if not np.issubdtype(length.dtype, np.integer) or length.min() < 0 or length.max() > steps:
+        raise DataError(f"{path}: length: expected integers in 0 to {steps}, found {length}")
+    arrays = arrays | {name: arrays[name].astype(np.float32) for name in _FLOATS if name in arrays}
+    valid = np.arange(steps + 1) <= length[:, None]
+    for name, columns, limit, meaning in _LIMITS:
+        if name in arrays:
+            values = arrays[name][valid[:, 1:] if name == "control" else valid][..., columns]
+            bad = ~(np.abs(values) <= limit)
+            if bad.any():
+                raise DataError(
+                    f"{path}: {name}: expected finite {meaning} within {limit:.4g}, "
+                    f"found {values[bad][0]:.4g} among {bad.sum()} such values"
+                )
+    state = arrays["state"]
+    speed = np.linalg.norm(state[:, :-1, 6:9], axis=-1)
+    moving = valid[:, 1:] & (speed > _MOVING)
+    travel = np.linalg.norm(np.diff(state[..., :3], axis=1), axis=-1)[moving]
+    ratio = np.median(travel / (speed[moving] * STEP_SECONDS)) if moving.any() else 1.0
+    if not _TRAVEL[0] < ratio < _TRAVEL[1]:
+        raise DataError(
+            f"{path}: state: expected positions in m that move with the velocity in m/s, one step "
+            f"in {STEP_SECONDS:g} s; found steps {ratio:.3g} times as long"
+        )
+    return arrays
 
 
 def _parse(path: Path, text: str, classes_known: bool) -> dict[str, Any]:
@@ -174,68 +222,3 @@ def _parse(path: Path, text: str, classes_known: bool) -> dict[str, Any]:
                 f"four x, y in m, to look the classes up on the map; found {text[:80]}"
             )
     return meta
-
-
-def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    control = arrays["control"].shape
-    if len(control) != 3:
-        raise DataError(f"{path}: control: expected shape [K, T, 2], found {list(control)}")
-    sizes = {"K": control[0], "T": control[1], "T + 1": control[1] + 1}
-    for name, array in arrays.items():
-        shape = _SHAPES[name]
-        wanted = tuple(size if isinstance(size, int) else sizes[size] for size in shape)
-        if array.shape != wanted:
-            raise DataError(
-                f"{path}: {name}: expected shape {list(wanted)} (K and T as in control), "
-                f"found {list(array.shape)}"
-            )
-    if not (control[0] and control[1]):
-        raise DataError(
-            f"{path}: control: expected one drive or more, of one step or more, "
-            f"found shape {list(control)}"
-        )
-    for name in _FLOATS:
-        if name in arrays and arrays[name].dtype.kind not in "fiu":
-            raise DataError(f"{path}: {name}: expected numbers, found dtype {arrays[name].dtype}")
-
-
-def _check_values(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Finite where valid, and in SI units: degrees, millimetres and km/h are told apart."""
-    length, steps = arrays["length"], arrays["control"].shape[1]
-    if not np.issubdtype(length.dtype, np.integer) or length.min() < 0 or length.max() > steps:
-        raise DataError(f"{path}: length: expected integers in 0 to {steps}, found {length}")
-    valid = np.arange(steps + 1) <= length[:, None]
-    state, control = arrays["state"][valid], arrays["control"][valid[:, 1:]]
-    limits = [
-        ("state", state[:, 0:3], _LARGEST_COORDINATE, "position in m"),
-        ("state", state[:, 3:6], 2 * np.pi, "roll, pitch and yaw in rad"),
-        ("state", state[:, 6:9], _LARGEST_SPEED, "velocity in m/s"),
-        ("state", state[:, 9:12], 10 * np.pi, "angular velocity in rad/s"),
-        ("control", control[:, 0], _LARGEST_SPEED, "commanded speed in m/s"),
-        ("control", control[:, 1], np.pi / 2, "front-wheel angle in rad"),
-    ]
-    limits += [
-        (name, arrays[name][valid], *_LARGEST[name]) for name in WHEEL_SIGNALS if name in arrays
-    ]
-    for name, values, limit, meaning in limits:
-        bad = ~(np.abs(values) <= limit)
-        if bad.any():
-            raise DataError(
-                f"{path}: {name}: expected finite {meaning} within {limit:.4g}, "
-                f"found {values[bad][0]:.4g} among {bad.sum()} such values"
-            )
-    _check_travel(path, arrays["state"], valid)
-
-
-def _check_travel(path: Path, state: np.ndarray, valid: np.ndarray) -> None:
-    speed = np.linalg.norm(state[:, :-1, 6:9], axis=-1)
-    moving = valid[:, 1:] & (speed > _MOVING)
-    if not moving.any():
-        return
-    travel = np.linalg.norm(np.diff(state[..., :3], axis=1), axis=-1)[moving]
-    ratio = np.median(travel / (speed[moving] * STEP_SECONDS))
-    if not _TRAVEL[0] < ratio < _TRAVEL[1]:
-        raise DataError(
-            f"{path}: state: expected positions in m that move with the velocity in m/s, one step "
-            f"in {STEP_SECONDS:g} s; found steps {ratio:.3g} times as long"
-        )

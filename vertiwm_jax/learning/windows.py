@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.typing import ArrayLike
 
 from vertiwm_jax.learning.dataset import Array, Drives, WheelSignals
 from vertiwm_jax.learning.schema import DataError
@@ -80,12 +81,13 @@ def index(
 
 
 @jax.jit
-def gather(drives: Drives, index: WindowIndex) -> Windows:
-    """Gathers the windows at `index`, which may be a batch of all; copies only those.
+def gather(drives: Drives, index: WindowIndex, rows: ArrayLike | None = None) -> Windows:
+    """Copies the windows at `index`, or those in some of its rows.
 
-    Pass drives that lie on the device (`jax.device_put`) when this is called more than once. A
-    batch is `jax.tree.map(lambda x: x[rows], index)`.
+    Pass drives that lie on the device (`jax.device_put`) when this is called more than once.
     """
+    if rows is not None:
+        index = jax.tree.map(lambda x: x[rows], index)
     steps = index.start[:, None] + jnp.arange(index.context + index.horizon + 1)
 
     def cut_out(array: Array, steps: jax.Array) -> jax.Array:

@@ -1,24 +1,25 @@
-"""`python -m vertiwm_jax.learning.compact`: stores drives in a tenth of the space.
+"""`python data/open/compact.py RECORDINGS FOLDER`: stores drives in a tenth of the space.
 
 A compact file is a file of the schema. Its numbers are float32, rounded to a fixed step that is a
 power of two, so that most bits are zero and compress well. Arrays that the schema does not name are
 left out, and values after the end of a drive repeat the last valid ones.
 """
 
+import argparse
 import io
 import json
 import sys
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 from vertiwm_jax import atomic
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.terrain import files
@@ -38,24 +39,15 @@ ELEVATION_STEP = 2.0**-12
 """The same for heights of maps, m."""
 
 
-@dataclass(frozen=True)
-class Compact:
-    """Writes collections of drives with their maps in compact form."""
-
-    source: tyro.conf.Positional[Path]
-    """Folder of collections, with maps beside or inside them."""
-    destination: tyro.conf.Positional[Path]
-    """Folder to write them to."""
-
-
-def main(argv: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command; expected failures end in one line and a status that is not 0."""
-    command = tyro.cli(
-        Compact, args=argv, prog="python -m vertiwm_jax.learning.compact", description=__doc__
-    )
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recordings", type=Path, help="folders of drives, with maps")
+    parser.add_argument("folder", type=Path, help="where to write them")
+    given = parser.parse_args(arguments)
     try:
-        sizes = write(command.source, command.destination)
-    except (ValueError, OSError, atomic.WriteError) as error:  # drives, maps or destination
+        sizes = write(given.recordings, given.folder)
+    except (UserError, ValueError, OSError) as error:
         sys.exit(f"error: {error}")
     for name, size in sizes.items():
         print(f"{name:<12} {size / 1e6:6.2f} MB")
