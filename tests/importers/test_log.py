@@ -78,12 +78,12 @@ def test_frames_are_converted(arrays, as_quaternion):
     ("field", "sample", "value", "message"),
     [
         ("time", 5, np.nan, "a.csv: time: expected finite numbers, found nan in sample 5"),
-        ("time", 5, 0.0, r"a.csv: time: expected stamps that increase, found 0.0 after 100\.\d+ "),
+        ("time", 5, 0.0, r"a.csv: time: expected stamps that increase, found 0.0 in sample 5 "),
         ("command_time", 5, 0.0, "a.csv: time of commands: expected stamps that increase"),
         ("position", 7, np.inf, "a.csv: position: expected finite numbers, found .* in sample 7"),
         ("velocity", 0, np.nan, "a.csv: velocity: expected finite numbers"),
         ("command", 2, np.nan, "a.csv: command: expected finite numbers"),
-        ("attitude", 3, 0.0, "a.csv: attitude: expected quaternions of length 1, found 0 in sam"),
+        ("attitude", 3, 0.0, "a.csv: attitude: expected quaternions of length 1, found 0.0 in sam"),
     ],
 )
 def test_what_cannot_be_used_is_named(arrays, field, sample, value, message):

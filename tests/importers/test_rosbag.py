@@ -123,6 +123,6 @@ def test_bags_that_cannot_be_used_are_named(bag, seen, tmp_path):
 
 
 def test_bags_need_a_package(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "rosbags", None)
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(DataError, match=r"package rosbags .* pip install 'vertiwm-jax\[logs\]'"):
         rosbag.read(tmp_path / "a.bag", ACKERMANN)

@@ -10,7 +10,6 @@ from importers.bags import Bag
 from importers.logged import SETTINGS, VEHICLE, errors, logged, rms, terrain
 
 from vertiwm_jax import config
-from vertiwm_jax.importers import collection
 from vertiwm_jax.importers.settings import (
     Frames,
     GridMapSettings,
@@ -189,7 +188,7 @@ def test_stopping_leaves_nothing(folder, tmp_path, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(collection, "write", stop)
+    monkeypatch.setattr(schema, "write", stop)
     with pytest.raises(SystemExit) as stopped:
         run(*arguments(folder, tmp_path / "drives"), "--map", folder / "level.npz")
     assert stopped.value.code == 130 and not list(tmp_path.iterdir())

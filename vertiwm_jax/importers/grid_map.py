@@ -117,8 +117,8 @@ def _patch(name: str, message: Any, layers: Sequence[str]) -> tuple[np.ndarray, 
     patch = np.stack(
         [np.roll(_layer(name, message, layer), start, (0, 1))[::-1, ::-1] for layer in layers]
     )
-    centre = np.array([info.pose.position.x, info.pose.position.y])
-    return patch, centre - info.resolution * (np.array(patch.shape[1:]) - 1) / 2
+    center = np.array([info.pose.position.x, info.pose.position.y])
+    return patch, center - info.resolution * (np.array(patch.shape[1:]) - 1) / 2
 
 
 def _layer(name: str, message: Any, layer: str) -> np.ndarray:

@@ -2,16 +2,17 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
+import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax import atomic, froude
 from vertiwm_jax import config as configuration
 from vertiwm_jax.evaluation.tables import markdown
-from vertiwm_jax.importers import collection, grid_map, resampling, rosbag, table, tartandrive
+from vertiwm_jax.importers import grid_map, resampling, rosbag, table
 from vertiwm_jax.importers.log import Log
 from vertiwm_jax.importers.resampling import Drive
 from vertiwm_jax.importers.settings import ImportSettings
@@ -19,15 +20,15 @@ from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.dataset import SPLITS
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.runs import Progress
-from vertiwm_jax.terrain import files
+from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain.map import TerrainMap
 
-Format = Literal["csv", "parquet", "rosbag", "tartandrive"]
-READERS: dict[Format, Callable[[Path, ImportSettings], list[Log]]] = {
-    "csv": table.read_csv,
-    "parquet": table.read_parquet,
+Format = Literal["csv", "parquet", "rosbag"]
+Reader = Callable[[Path, ImportSettings], list[Log]]
+READERS: dict[Format, Reader] = {
+    "csv": partial(table.read, columns_of=table.csv_columns),
+    "parquet": partial(table.read, columns_of=table.parquet_columns),
     "rosbag": rosbag.read,
-    "tartandrive": tartandrive.read,
 }
 ENDINGS: dict[str, Format] = {
     ".csv": "csv",
@@ -35,23 +36,11 @@ ENDINGS: dict[str, Format] = {
     ".bag": "rosbag",
     ".db3": "rosbag",
     ".mcap": "rosbag",
-    ".pt": "tartandrive",
 }
-
-
+PER_FILE = SPLITS["test"].stop
+"""Drives in a file. The first of them are for training, the last for tests."""
 LARGEST_ANGLE = np.radians(20)
 """Between velocity and motion, in the median: another frame, or w before x, lie beyond."""
-
-
-@dataclass(frozen=True)
-class Imported:
-    """What became of one source: its drives, and how many poses a second of its time it held."""
-
-    source: Path
-    drives: list[Drive]
-    poses_per_second: float
-    derived: tuple[str, ...]
-    left_out: Counter[str]
 
 
 def import_drives(
@@ -81,25 +70,31 @@ def import_drives(
     readers = [_reader(source, format) for source in sources]
     with atomic.new_folder(output) as unfinished:
         terrain, said = _terrain(sources, settings_file, settings, map)
-        imported = []
+        drives, rows = list[Drive](), list[list[str]]()
         with Progress(len(sources), "logs") as progress:
             for source, read in zip(sources, readers, strict=True):
-                imported.append(_import(source, read(source, settings), settings, terrain))
+                found, row = _import(source, read, settings, terrain)
+                drives += found
+                rows.append(row)
                 progress.advance(1, source.name)
-        drives = [drive for each in imported for drive in each.drives]
         if not drives:
+            reasons = "; ".join(row[-1] for row in rows)
             raise DataError(
-                f"{sources[0]}: expected a drive or more that can be used, found none: "
-                + "; ".join(_reasons(each) for each in imported)
+                f"{sources[0]}: expected a drive or more that can be used, found none: {reasons}"
             )
-        meta = {"sources": [str(source) for source in sources]}
+        (unfinished / "maps").mkdir()
+        files.save(terrain, unfinished / "maps" / "map.npz")
+        meta = {"sources": [str(source) for source in sources], "map": "map.npz"}
         wheels = settings.vehicle.wheels_in_body_xy
-        collection.write(unfinished, drives, terrain, wheels, meta)
+        for number, first in enumerate(range(0, len(drives), PER_FILE)):
+            some = _arrays(drives[first : first + PER_FILE])
+            schema.write(unfinished / f"drives_{number:03d}.npz", some, meta, wheels)
+    heads = ["log", "poses a second", "from poses", "drives", "steps", "left out"]
     remarks = _remarks(drives, terrain, settings.vehicle.scale)
-    return "\n".join([_table(imported), "", *said, *remarks])
+    return "\n".join([markdown(heads, rows), "", *said, *remarks])
 
 
-def _reader(source: Path, asked: Format | None) -> Callable[[Path, ImportSettings], list[Log]]:
+def _reader(source: Path, asked: Format | None) -> Reader:
     if not source.exists():
         raise DataError(f"{source}: expected a file or folder of logs, found none")
     if asked is None:
@@ -131,60 +126,57 @@ def _terrain(
 
 
 def _import(
-    source: Path, logs: list[Log], settings: ImportSettings, terrain: TerrainMap
-) -> Imported:
-    """The drives of all logs of a source that are on the map."""
-    drives, left_out = [], Counter[str]()
-    point = settings.vehicle.scale * np.asarray(settings.vehicle.logged_point)
+    source: Path, read: Reader, settings: ImportSettings, terrain: TerrainMap
+) -> tuple[list[Drive], list[str]]:
+    """The drives of a source that are on the map, and its row of the table.
+
+    Raises `DataError` unless all drives are of the schema, and move where they say.
+    """
+    logs, scale = read(source, settings), settings.vehicle.scale
+    drives, left_out = list[Drive](), Counter[str]()
+    point = scale * np.asarray(settings.vehicle.logged_point)
     for log in logs:
         found = resampling.resample(log, settings.resampling, point)
+        drives += found.drives
         left_out += found.left_out
-        if found.drives:
-            _check(source, found.drives)
-        kept = [drive for drive in found.drives if collection.on_map(terrain, drive)]
-        left_out["off the map"] += len(found.drives) - len(kept)
-        drives += kept
-    first, apart = logs[0], [np.diff(log.time) for log in logs]
-    derived = {"velocity": first.velocity, "angular velocity": first.angular_velocity}
-    return Imported(
-        source=source,
-        drives=drives,
-        poses_per_second=settings.vehicle.scale**0.5 / float(np.median(np.concatenate(apart))),
-        derived=tuple(name for name, logged in derived.items() if logged is None),
-        left_out=+left_out,
-    )
+    if drives:
+        schema.check(source, _arrays(drives))
+        way_off, _ = resampling.directions(drives)
+        if way_off > LARGEST_ANGLE:
+            raise DataError(
+                f"{source}: velocity: expected to point where the positions go, found "
+                f"{np.degrees(way_off):.0f} degrees off in half of the steps; see `frames` of the "
+                "settings, and the order of quaternions"
+            )
+    low, high = map(np.asarray, terrain.extent)
+    paths = (drive.state[:, :2] for drive in drives)
+    inside = [((xy >= low) & (xy <= high)).all() for xy in paths]
+    kept = [drive for drive, stays in zip(drives, inside, strict=True) if stays]
+    left_out["off the map"] += len(drives) - len(kept)
+    reasons = ", ".join(f"{count} {why}" for why, count in left_out.items() if count)
+    apart = np.median(np.concatenate([np.diff(log.time) for log in logs]))
+    derived = {"velocity": logs[0].velocity, "angular velocity": logs[0].angular_velocity}
+    return kept, [
+        str(source),
+        f"{scale**0.5 / apart:.1f}",
+        ", ".join(name for name, logged in derived.items() if logged is None) or "-",
+        str(len(kept)),
+        f"{sum(len(drive.control) for drive in kept):,}",
+        reasons or "-",
+    ]
 
 
-def _check(source: Path, drives: Sequence[Drive]) -> None:
-    """Raises `DataError` unless the drives are of the schema, and move where they say."""
-    schema.check(source, collection.arrays(drives))
-    way_off, _ = resampling.directions(drives)
-    if way_off > LARGEST_ANGLE:
-        raise DataError(
-            f"{source}: velocity: expected to point where the positions go, found "
-            f"{np.degrees(way_off):.0f} degrees off in half of the steps; see `frames` of the "
-            "settings, and the order of quaternions"
-        )
-
-
-def _table(imported: Sequence[Imported]) -> str:
-    rows = []
-    for each in imported:
-        steps = sum(len(drive.control) for drive in each.drives)
-        speed, derived = f"{each.poses_per_second:.1f}", ", ".join(each.derived) or "-"
-        drives = f"{len(each.drives)}", f"{steps:,}"
-        rows.append((str(each.source), speed, derived, *drives, _reasons(each)))
-    heads = ["log", "poses a second", "from poses", "drives", "steps", "left out"]
-    return markdown(heads, rows)
-
-
-def _reasons(each: Imported) -> str:
-    return ", ".join(f"{count} {why}" for why, count in each.left_out.items()) or "-"
+def _arrays(drives: Sequence[Drive]) -> dict[str, np.ndarray]:
+    """All drives as arrays of the schema."""
+    return schema.join([schema.drive(drive.state, drive.control) for drive in drives])
 
 
 def _remarks(drives: Sequence[Drive], terrain: TerrainMap, scale: float) -> list[str]:
     """Whether the settings fit, in the units of the vehicle itself."""
-    low, middle, high = collection.clearance(terrain, drives) / scale
+    position = np.concatenate([drive.state[:, :3] for drive in drives])
+    ground = query.surface(terrain, jnp.asarray(position[:, :2], jnp.float32)).height
+    above = (position[:, 2] - np.asarray(ground)) / scale
+    low, middle, high = np.quantile(above, [0.25, 0.5, 0.75])
     _, axis_off = resampling.directions(drives)
     lines = [
         f"the body origin is {middle:.3g} m above the map, half of the time within {low:.3g} and "
@@ -196,6 +188,6 @@ def _remarks(drives: Sequence[Drive], terrain: TerrainMap, scale: float) -> list
     if lacking:
         lines.append(
             f"{len(drives)} drives are too few for {' and '.join(lacking)}: expected "
-            f"{collection.PER_FILE} or more; a smaller resampling.longest makes more of them"
+            f"{PER_FILE} or more; a smaller resampling.longest makes more of them"
         )
     return lines

@@ -1,7 +1,9 @@
 """A logged drive, checked and converted to SI units, full size and the axes of this project."""
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -57,24 +59,26 @@ def build(
     }
     for field, array in arrays.items():
         if array is not None:
-            _check_finite(name, field, array)
+            _check_finite(f"{name}: {field}", array)
     if len(time) < 2:
         raise DataError(f"{name}: time: expected two poses or more, found one")
-    _check_increasing(name, "time", time)
-    _check_increasing(name, "time of commands", command_time)
+    _check_increasing(f"{name}: time", time)
+    _check_increasing(f"{name}: time of commands", command_time)
     units, frames = settings.units, settings.frames
-    metre = settings.vehicle.scale
-    second = metre**0.5  # Froude's similarity: gravity is the same at any size.
+    meter = settings.vehicle.scale
+    second = meter**0.5  # Froude's similarity: gravity is the same at any size.
     # Half a turn about x takes z_down to z_up, in the world and in the body.
     axes = np.array([1, 1, 1] if frames.axes == "z_up" else [1, -1, -1])
     if attitude.shape[1] == 3:
         rpy = axes * units.angle * attitude
         rotation = Rotation.from_euler("ZYX", rpy[:, ::-1])
     else:
-        _check_length(name, attitude)
+        length = np.linalg.norm(attitude, axis=1)
+        wrong = np.abs(length - 1) > 0.01
+        _refuse(f"{name}: attitude: expected quaternions of length 1", wrong, length)
         rotation = Rotation.from_quat(attitude * [*axes, 1])
     if velocity is not None:
-        velocity = axes * units.velocity * metre / second * velocity
+        velocity = axes * units.velocity * meter / second * velocity
         velocity = velocity if frames.velocity == "body" else rotation.inv().apply(velocity)
     if angular_velocity is not None:
         omega = axes * units.angle / second * angular_velocity
@@ -83,41 +87,43 @@ def build(
         )
     return Log(
         time=second * units.time * time,
-        position=metre * (axes * units.position * position - np.asarray(frames.origin)),
+        position=meter * (axes * units.position * position - np.asarray(frames.origin)),
         rotation=rotation,
         velocity=velocity,
         angular_velocity=angular_velocity,
         command_time=second * units.time * command_time,
-        command=command * [metre / second * units.speed, units.steering],
+        command=command * [meter / second * units.speed, units.steering],
     )
 
 
-def _check_finite(name: str | Path, field: str, array: np.ndarray) -> None:
+def needed(path: Path, module: str) -> Any:
+    """A module that reading `path` needs; `DataError` where its package is not installed."""
+    try:
+        return import_module(module)
+    except ImportError:
+        raise DataError(
+            f"{path}: expected the package {module.split('.')[0]} to read it, it is not installed; "
+            "pip install 'vertiwm-jax[logs]'"
+        ) from None
+
+
+def _check_finite(field: str, array: np.ndarray) -> None:
     if not len(array):
-        raise DataError(f"{name}: {field}: expected one value or more, found none")
-    bad = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(1))
-    if len(bad):
+        raise DataError(f"{field}: expected one value or more, found none")
+    wrong = ~np.isfinite(array.reshape(len(array), -1)).all(1)
+    _refuse(f"{field}: expected finite numbers", wrong, array)
+
+
+def _check_increasing(field: str, stamps: np.ndarray) -> None:
+    wrong = np.diff(stamps, prepend=-np.inf) <= 0
+    _refuse(f"{field}: expected stamps that increase", wrong, stamps)
+
+
+def _refuse(expected: str, wrong: np.ndarray, values: np.ndarray) -> None:
+    """Raises `DataError` where samples are wrong: `[N]` whether each is, of `[N, ...]` values."""
+    samples = np.flatnonzero(wrong)
+    if len(samples):
+        first = samples[0]
         raise DataError(
-            f"{name}: {field}: expected finite numbers, found {array[bad[0]]} in sample {bad[0]} "
-            f"among {len(bad)} such"
-        )
-
-
-def _check_increasing(name: str | Path, field: str, stamps: np.ndarray) -> None:
-    bad = np.flatnonzero(np.diff(stamps) <= 0)
-    if len(bad):
-        sample = bad[0] + 1
-        raise DataError(
-            f"{name}: {field}: expected stamps that increase, found {stamps[sample]} after "
-            f"{stamps[sample - 1]} in sample {sample} among {len(bad)} such"
-        )
-
-
-def _check_length(name: str | Path, quaternion: np.ndarray) -> None:
-    length = np.linalg.norm(quaternion, axis=1)
-    bad = np.flatnonzero(np.abs(length - 1) > 0.01)
-    if len(bad):
-        raise DataError(
-            f"{name}: attitude: expected quaternions of length 1, found {length[bad[0]]:.4g} in "
-            f"sample {bad[0]} among {len(bad)} such"
+            f"{expected}, found {values[first]} in sample {first} among {len(samples)} such"
         )

@@ -1,7 +1,5 @@
 """Turns simulated drives into logs as a real vehicle would write them: noisy, late, with gaps."""
 
-import csv
-import io
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from vertiwm_jax import atomic, froude
 from vertiwm_jax import config as configuration
 from vertiwm_jax.config import Bounds, NotNegative, Positive, settings
-from vertiwm_jax.importers.settings import ImportSettings, Resampling, Table, VehicleSettings
+from vertiwm_jax.importers.settings import ImportSettings, Table, VehicleSettings
 from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig, load
@@ -38,7 +36,7 @@ class NoiseConfig:
     """rad, standard deviation about each axis."""
     latency: NotNegative = 0.02
     """s by which the stamp of a pose is late. Stamps of commands are exact."""
-    dropped: Annotated[float, Bounds(0, 1, below=True)] = 0.05
+    dropped: Annotated[float, Bounds("at least 0 and below 1", lambda x: 0 <= x < 1)] = 0.05
     """Share of samples that are lost."""
 
 
@@ -65,40 +63,28 @@ def make_logs(
     sources = sorted(data.glob("*.npz"))
     if not sources:
         raise DataError(f"{data}: expected .npz files of drives, found none")
-    rows_written = 0
+    samples = 0
     with atomic.new_folder(output) as unfinished:
         (unfinished / "maps").mkdir()
         for source in sources:
             arrays, meta = schema.read(source)
-            rows = _rows(arrays, driven.scale, noise, rng)
-            rows_written += len(rows)
-            atomic.write(unfinished / f"{source.stem}.csv", _text(rows))
+            rows = []
+            for number, length in enumerate(arrays["length"]):
+                state = arrays["state"][number, : length + 1]
+                control = arrays["control"][number, :length]
+                drive = logged(state, control, driven.scale, noise, rng)
+                rows.append(np.insert(drive, 0, number, axis=1))
+            samples += sum(map(len, rows))
+            kinds = ["%d"] + ["%.6g"] * (len(COLUMNS) - 1)
+            head = {"header": ",".join(COLUMNS), "comments": ""}
+            file = unfinished / f"{source.stem}.csv"
+            np.savetxt(file, np.concatenate(rows), kinds, ",", **head)
             terrain = files.load_map(schema.find_map(source, meta["map"]))
             small = froude.scaled(terrain, 1 / driven.scale)
             files.save(small, unfinished / "maps" / source.name)
         configuration.save(_settings(driven), unfinished / "settings.yaml")
-    kept = 1 - noise.dropped
-    return rows_written / kept / noise.rate, [source.stem for source in sources]
-
-
-def _rows(
-    arrays: dict[str, np.ndarray], scale: float, config: NoiseConfig, rng: np.random.Generator
-) -> np.ndarray:
-    """`[N, 11]` of `COLUMNS`, one drive after the other."""
-    found = []
-    for number, length in enumerate(arrays["length"]):
-        state, control = arrays["state"][number, : length + 1], arrays["control"][number, :length]
-        rows = logged(state, control, scale, config, rng)
-        found.append(np.insert(rows, 0, number, axis=1))
-    return np.concatenate(found)
-
-
-def _text(rows: np.ndarray) -> str:
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows([int(row[0]), *(f"{value:.6g}" for value in row[1:])] for row in rows)
-    return stream.getvalue()
+    seconds = samples / (1 - noise.dropped) / noise.rate
+    return seconds, [source.stem for source in sources]
 
 
 def _settings(driven: VehicleConfig) -> ImportSettings:
@@ -111,7 +97,7 @@ def _settings(driven: VehicleConfig) -> ImportSettings:
         steering="steering",
     )
     wheels = VehicleSettings(driven.wheelbase, driven.track, scale=driven.scale)
-    return ImportSettings(wheels, resampling=Resampling(), table=columns)
+    return ImportSettings(wheels, table=columns)
 
 
 def logged(
@@ -127,14 +113,14 @@ def logged(
     rows. Between its steps a drive is a cubic that has its positions and velocities, and turns
     evenly.
     """
-    metre, second = scale, scale**0.5
+    meter, second = scale, scale**0.5
     known = STEP_SECONDS / second * np.arange(len(state))
     rotation = Rotation.from_euler("ZYX", state[:, 5:2:-1])
-    velocity = rotation.apply(state[:, 6:9]) * second / metre
+    velocity = rotation.apply(state[:, 6:9]) * second / meter
     stamps = np.arange(config.latency, known[-1], 1 / config.rate)
     stamps = stamps[rng.random(len(stamps)) >= config.dropped]
     seen = stamps - config.latency
-    position = CubicHermiteSpline(known, state[:, :3] / metre, velocity)(seen)
+    position = CubicHermiteSpline(known, state[:, :3] / meter, velocity)(seen)
     turned = Rotation.from_rotvec(config.attitude * rng.normal(size=(len(stamps), 3)))
     step = np.minimum(
         np.searchsorted(known, stamps + _TOLERANCE, side="right") - 1, len(control) - 1
@@ -144,6 +130,6 @@ def logged(
             stamps,
             position + config.position * rng.normal(size=position.shape),
             (Slerp(known, rotation)(seen) * turned).as_quat(),
-            control[step] * [second / metre, 1.0],
+            control[step] * [second / meter, 1.0],
         ]
     )

@@ -96,7 +96,8 @@ def messages(path: Path, topic: str, kinds: Sequence[str]) -> Iterator[tuple[int
 
     Raises `DataError` where the bag cannot be read, or has no such messages.
     """
-    highlevel, typesys = _rosbags(path)
+    highlevel = log.needed(path, "rosbags.highlevel")
+    typesys = log.needed(path, "rosbags.typesys")
     if path.suffix in (".db3", ".mcap"):  # Of a folder that says what is in it.
         path = path.parent
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
@@ -148,14 +149,3 @@ def _command(message: Any) -> tuple[float, float, bool]:
 
 def _xyz(vector: Any) -> list[float]:
     return [vector.x, vector.y, vector.z]
-
-
-def _rosbags(path: Path) -> tuple[Any, Any]:
-    try:
-        from rosbags import highlevel, typesys
-    except ImportError:
-        raise DataError(
-            f"{path}: expected the package rosbags to read bags, it is not installed; "
-            "pip install 'vertiwm-jax[logs]'"
-        ) from None
-    return highlevel, typesys

@@ -1,9 +1,9 @@
 """Settings that describe a log: the vehicle, units, frames, and the names of its data."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from vertiwm_jax.config import Positive, settings
+from vertiwm_jax.config import Bounds, Positive, choices, settings
 from vertiwm_jax.terrain.classes import STANDARD
 
 Triple = tuple[float, float, float]
@@ -20,7 +20,7 @@ class VehicleSettings:
     """m between left and right wheels."""
     logged_point: Triple = (0.0, 0.0, 0.0)
     """The point whose position is logged, in the body frame of this project (x forward, y left,
-    z up, from the point between the four wheel centres), m."""
+    z up, from the point between the four wheel centers), m."""
     scale: Positive = 1.0
     """The factor from the vehicle to full size, as in its file: 10 for a 1/10-scale rover. Drives
     and map are enlarged by it, times and speeds by its square root, before `resampling`."""
@@ -32,27 +32,25 @@ class VehicleSettings:
         return [[x, y], [x, -y], [-x, y], [-x, -y]]
 
 
+_Factor = Annotated[float, Bounds("how many SI units one unit is", bool)]
+
+
 @settings
 class Units:
     """How many SI units one unit of the log is: 1e-9 s for nanoseconds, 0.27778 m/s for km/h."""
 
-    time: float = 1.0
+    time: _Factor = 1.0
     """s."""
-    position: float = 1.0
+    position: _Factor = 1.0
     """m."""
-    angle: float = 1.0
+    angle: _Factor = 1.0
     """rad; angular velocities are such angles a second."""
-    velocity: float = 1.0
+    velocity: _Factor = 1.0
     """m/s, of logged velocities."""
-    speed: float = 1.0
+    speed: _Factor = 1.0
     """m/s, of commanded speeds. Where a throttle was logged: the speed at a throttle of 1."""
-    steering: float = 1.0
+    steering: _Factor = 1.0
     """rad of the front wheels, rad/s of commanded yaw rates; negative where right is positive."""
-
-    def check(self):
-        for name, value in vars(self).items():
-            if value == 0:
-                raise ValueError(f"{name}: expected how many SI units one unit is, found 0")
 
 
 @dataclass(frozen=True)
@@ -139,8 +137,8 @@ class GridMapSettings:
 
     def check(self):
         if self.ground not in STANDARD.names:
-            names = ", ".join(STANDARD.names)
-            raise ValueError(f"ground: expected one of {names}, found {self.ground}")
+            expected = choices(self.ground, STANDARD.names)
+            raise ValueError(f"ground: expected {expected}, found {self.ground}")
 
 
 @dataclass(frozen=True)
@@ -160,17 +158,6 @@ class Topics:
 
 
 @dataclass(frozen=True)
-class Trajectories:
-    """Names in a trajectory of TartanDrive."""
-
-    state: str = "state"
-    """Name of the observation or folder with position, quaternion (x, y, z, w) and, if any,
-    velocities."""
-    command: str = "cmd"
-    """Name of the folder with throttle and steering."""
-
-
-@dataclass(frozen=True)
 class ImportSettings:
     """The settings file of `import_drives`."""
 
@@ -182,5 +169,3 @@ class ImportSettings:
     """Columns of CSV and Parquet files."""
     rosbag: Topics | None = None
     """Topics of ROS bags."""
-    tartandrive: Trajectories = Trajectories()
-    """Names in TartanDrive's files."""

@@ -1,6 +1,7 @@
 """Reads CSV and Parquet files: one row per time stamp, with columns named by the settings."""
 
 import csv
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -13,24 +14,15 @@ from vertiwm_jax.importers.settings import ImportSettings, Table
 from vertiwm_jax.learning.schema import DataError
 
 Columns = dict[str, np.ndarray]
+ColumnReader = Callable[[Path, Sequence[str]], Columns]
 
 
-def read_csv(path: Path, settings: ImportSettings) -> list[Log]:
-    """The drives of a CSV file with a header line, in the order in which they begin.
+def read(path: Path, settings: ImportSettings, columns_of: ColumnReader) -> list[Log]:
+    """The drives of a file, in the order in which they begin.
 
-    Raises `DataError` naming file, column and expectation.
+    columns_of: `csv_columns` or `parquet_columns`. Raises `DataError` naming file, column and
+    expectation.
     """
-    return _read(path, settings, _csv_columns)
-
-
-def read_parquet(path: Path, settings: ImportSettings) -> list[Log]:
-    """The same of a Parquet file; needs pyarrow."""
-    return _read(path, settings, _parquet_columns)
-
-
-def _read(
-    path: Path, settings: ImportSettings, columns_of: Callable[[Path, list[str]], Columns]
-) -> list[Log]:
     table = settings.table
     if table is None:
         raise DataError(f"{path}: expected settings with a section `table` that names its columns")
@@ -39,15 +31,45 @@ def _read(
         return [_log(str(path), columns, table, settings)]
     drives = columns.pop(table.drive).astype(str)
     labels, first = np.unique(drives, return_index=True)
-    return [
-        _log(
-            f"{path}: drive {label}",
-            {name: column[drives == label] for name, column in columns.items()},
-            table,
-            settings,
-        )
-        for label in labels[np.argsort(first)]
-    ]
+    logs = []
+    for label in labels[np.argsort(first)]:
+        own = {name: column[drives == label] for name, column in columns.items()}
+        logs.append(_log(f"{path}: drive {label}", own, table, settings))
+    return logs
+
+
+def csv_columns(path: Path, names: Sequence[str]) -> Columns:
+    """Columns of a CSV file with a header line, as text."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file, warnings.catch_warnings():
+            head = [name.strip() for name in next(csv.reader(file), [])]
+            _check_head(path, names, head)
+            warnings.simplefilter("ignore", UserWarning)  # of a file without rows
+            kind = {"dtype": str, "delimiter": ",", "quotechar": '"', "comments": None}
+            chosen = [head.index(name) for name in names]
+            filled = (line for line in file if line.strip(" ,\t\r\n"))
+            cells = np.loadtxt(filled, **kind, usecols=chosen, ndmin=2)
+    except DataError:
+        raise
+    except (ValueError, csv.Error) as error:
+        raise DataError(f"{path}: expected a CSV file in UTF-8: {error}") from None
+    if not len(cells):
+        raise DataError(f"{path}: expected rows below the head, found none")
+    return dict(zip(names, cells.T, strict=True))
+
+
+def parquet_columns(path: Path, names: Sequence[str]) -> Columns:
+    """Columns of a Parquet file; needs pyarrow."""
+    parquet = log.needed(path, "pyarrow.parquet")
+    try:
+        file = parquet.ParquetFile(path)
+        _check_head(path, names, file.schema_arrow.names)
+        table = file.read(columns=list(names))
+        return {name: table[name].to_numpy() for name in names}
+    except DataError:
+        raise
+    except Exception as error:  # Of pyarrow, of which some are not its own.
+        raise DataError(f"{path}: expected a Parquet file: {one_line(error)}") from None
 
 
 def _names(table: Table) -> list[str]:
@@ -85,49 +107,6 @@ def _numbers(name: str, key: str, column: np.ndarray) -> np.ndarray:
         return column.astype(np.float64)
     except (ValueError, TypeError) as error:
         raise DataError(f"{name}: {key}: expected numbers: {error}") from None
-
-
-def _csv_columns(path: Path, names: Sequence[str]) -> Columns:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.reader(file, skipinitialspace=True)
-            head = next(rows, [])
-            _check_head(path, names, head)
-            places = [head.index(name) for name in names]
-            cells = []
-            for row in rows:
-                if not any(cell.strip() for cell in row):
-                    continue
-                if len(row) != len(head):
-                    raise DataError(
-                        f"{path}: line {rows.line_num}: expected {len(head)} values as in the "
-                        f"head, found {len(row)}"
-                    )
-                cells.append([row[place] for place in places])
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path}: expected a CSV file in UTF-8: {error}") from None
-    if not cells:
-        raise DataError(f"{path}: expected rows below the head, found none")
-    return dict(zip(names, np.array(cells).T, strict=True))
-
-
-def _parquet_columns(path: Path, names: Sequence[str]) -> Columns:
-    try:
-        from pyarrow import parquet
-    except ImportError:
-        raise DataError(
-            f"{path}: expected the package pyarrow to read Parquet, it is not installed; "
-            "pip install 'vertiwm-jax[logs]'"
-        ) from None
-    try:
-        file = parquet.ParquetFile(path)
-        _check_head(path, names, file.schema_arrow.names)
-        table = file.read(columns=list(names))
-        return {name: table[name].to_numpy() for name in names}
-    except DataError:
-        raise
-    except Exception as error:  # Of pyarrow, of which some are not its own.
-        raise DataError(f"{path}: expected a Parquet file: {one_line(error)}") from None
 
 
 def _check_head(path: Path, names: Sequence[str], head: Sequence[str]) -> None:
