@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from vertiwm_jax import config
 from vertiwm_jax.config import (
     AtLeastOne,
-    Bounds,
     ConfigError,
     Count,
     CountOrZero,
@@ -63,7 +62,7 @@ class Bounded:
     count: Count = 1
     repeats: CountOrZero | None = None
     rate: Positive = 1.0
-    weights: Annotated[tuple[float, float], Bounds(0)] = (0.0, 1.0)
+    weights: tuple[NotNegative, NotNegative] = (0.0, 1.0)
     discount: Discount = 0.9
     share: Share = 1.0
     noise: NotNegative = 0.0
@@ -150,7 +149,7 @@ OUT_OF_BOUNDS = [
     ({"discount": 1.0}, "discount: expected between 0 and 1, found 1.0"),
     ({"share": 1.5}, "share: expected 0 to 1, found 1.5"),
     ({"noise": -0.5}, "noise: expected at least 0, found -0.5"),
-    ({"names": ()}, "names: expected at least one, found none"),
+    ({"names": ()}, "names: expected at least one, found ()"),
 ]
 
 

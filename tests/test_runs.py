@@ -146,8 +146,9 @@ def test_an_interrupted_log_leaves_whole_lines(tmp_path, monkeypatch):
     assert steps(run.folder) == [1, 2]
 
 
-def test_progress_is_plain_lines_without_a_terminal(capsys):
-    with Progress(2000, "training", seconds_between_lines=3600) as progress:
+def test_progress_is_plain_lines_without_a_terminal(capsys, monkeypatch):
+    monkeypatch.setattr(runs, "SECONDS_BETWEEN_LINES", 3600.0)
+    with Progress(2000, "training") as progress:
         for _ in range(4):
             progress.advance(500, "return 3.2")
     text = capsys.readouterr().out

@@ -9,10 +9,9 @@ import contextlib
 import dataclasses
 import difflib
 import functools
-import math
 import re
 import types
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import (
     Annotated,
@@ -20,7 +19,6 @@ from typing import (
     Literal,
     TypeVar,
     Union,
-    cast,
     dataclass_transform,
     get_args,
     get_origin,
@@ -44,47 +42,34 @@ class ConfigError(UserError, ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """Where a number has to lie, or each number of a tuple; for `Annotated`."""
+    """What a setting has to be, in words and as a test of a value; for `Annotated`."""
 
-    low: float
-    high: float = math.inf
-    above: bool = False
-    """Whether `low` itself is too low."""
-    below: bool = False
-    """Whether `high` itself is too high."""
+    words: str
+    holds: Callable[[Any], bool]
+    of_each: bool = True
+    """Whether each entry of a tuple is tested, or the tuple."""
 
-    def __contains__(self, value: float) -> bool:
-        if not (self.low < value if self.above else self.low <= value):
-            return False
-        return value < self.high if self.below else value <= self.high
-
-    def __str__(self) -> str:
-        low, high = f"{self.low:g}", f"{self.high:g}"
-        least = f"{'more than' if self.above else 'at least'} {low}"
-        if self.high == math.inf:
-            return least
-        if self.above == self.below:
-            return f"between {low} and {high}" if self.above else f"{low} to {high}"
-        return f"{least} and {'below' if self.below else 'at most'} {high}"
+    def refuses(self, value: Any) -> bool:
+        """Whether the value is out of bounds; None never is."""
+        each = value if self.of_each and isinstance(value, tuple) else (value,)
+        return value is not None and not all(map(self.holds, each))
 
 
-class AtLeastOne:
-    """Says that a tuple may not be empty; for `Annotated`."""
-
-
-Positive = Annotated[float, Bounds(0, above=True)]
-NotNegative = Annotated[float, Bounds(0)]
-Share = Annotated[float, Bounds(0, 1)]
-Discount = Annotated[float, Bounds(0, 1, above=True, below=True)]
-Count = Annotated[int, Bounds(1)]
-CountOrZero = Annotated[int, Bounds(0)]
+Positive = Annotated[float, Bounds("more than 0", lambda x: x > 0)]
+NotNegative = Annotated[float, Bounds("at least 0", lambda x: x >= 0)]
+Share = Annotated[float, Bounds("0 to 1", lambda x: 0 <= x <= 1)]
+Discount = Annotated[float, Bounds("between 0 and 1", lambda x: 0 < x < 1)]
+Count = Annotated[int, Bounds("at least 1", lambda x: x >= 1)]
+CountOrZero = Annotated[int, Bounds("at least 0", lambda x: x >= 0)]
+AtLeastOne = Bounds("at least one", bool, of_each=False)
+"""Of a tuple that may not be empty."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def settings(cls: type[T]) -> type[T]:
     """A frozen dataclass whose values are checked whenever one is made.
 
-    Numbers have to lie within the `Bounds` of their annotations. Then the method `check`, if there
+    Values have to lie within the `Bounds` of their annotations. Then the method `check`, if there
     is one, looks at what joins several fields, and raises `ValueError`. Values that are refused
     raise `ConfigError`. A class variable `GONE` says of keys of earlier versions what became of
     them, for files that still have them.
@@ -93,13 +78,8 @@ def settings(cls: type[T]) -> type[T]:
     def check_all(self: Any) -> None:
         for name, bounds, options in _bounds_of_fields(type(self)):
             value = getattr(self, name)
-            if bounds is AtLeastOne:
-                if not value:
-                    raise ConfigError(f"{name}: expected at least one{options}, found none")
-            elif value is not None:
-                numbers = value if isinstance(value, tuple) else (value,)
-                if not all(number in bounds for number in numbers):
-                    raise ConfigError(f"{name}: expected {bounds}, found {value}")
+            if bounds.refuses(value):
+                raise ConfigError(f"{name}: expected {bounds.words}{options}, found {value}")
         try:
             getattr(self, "check", lambda: None)()
         except ConfigError:
@@ -112,15 +92,14 @@ def settings(cls: type[T]) -> type[T]:
 
 
 @functools.cache
-def _bounds_of_fields(cls: Any) -> list[tuple[str, Any, str]]:
+def _bounds_of_fields(cls: Any) -> list[tuple[str, Bounds, str]]:
     """Of each field that has some: name, bounds, and what may be chosen, if anything."""
     hints, found = get_type_hints(cls, include_extras=True), []
     for field in dataclasses.fields(cls):
         parts = list(_parts(hints[field.name]))
-        options = [part for part in parts if isinstance(part, str)]
-        told = f" of {', '.join(options)}" if options else ""
-        bounds = (part for part in parts if isinstance(part, Bounds) or part is AtLeastOne)
-        found += [(field.name, each, told) for each in bounds]
+        options = ", ".join(part for part in parts if isinstance(part, str))
+        options = f" of {options}" if options else ""
+        found += [(field.name, part, options) for part in parts if isinstance(part, Bounds)]
     return found
 
 
@@ -159,9 +138,8 @@ def load(cls: type[T], path: str | Path) -> T:
     """Read the YAML file at `path` into the dataclass `cls`.
 
     Keys that the file leaves out take the dataclass's defaults; within a nested dataclass, those of
-    the default instance. A missing file, an unknown,
-    repeated, missing or ill-typed key, or a value that the dataclass refuses raises
-    `ConfigError`.
+    the default instance. A missing file, an unknown, repeated, missing or ill-typed key, or a value
+    that the dataclass refuses raises `ConfigError`.
     """
     path = Path(path)
     try:
@@ -206,34 +184,21 @@ def _convert(value: Any, kind: Any, field: str) -> Any:
         for option in args:
             with contextlib.suppress(_MismatchError):
                 return _convert(value, option, field)
-        raise _mismatch(value, kind, field)
-    if origin is Literal:
-        if any(value == option and type(value) is type(option) for option in args):
+    elif origin is Literal:
+        if (type(value), value) in [(type(option), option) for option in args]:
             return value
-        raise _mismatch(value, kind, field)
-    if origin is tuple:
-        if not isinstance(value, list):
-            raise _mismatch(value, kind, field)
+    elif origin is tuple and isinstance(value, list):
         kinds = args[:1] * len(value) if args[-1] is Ellipsis else args
-        if len(kinds) != len(value):
-            raise _mismatch(value, kind, field)
-        return tuple(
-            _convert(item, kind, f"{field}[{i}]")
-            for i, (item, kind) in enumerate(zip(value, kinds, strict=True))
-        )
-    if kind is types.NoneType:
-        if value is not None:
-            raise _mismatch(value, kind, field)
-        return None
-    if kind is Path and isinstance(value, str):
-        return Path(value)
-    if kind is float and type(value) is int:
+        if len(kinds) == len(value):
+            items = zip(value, kinds, strict=True)
+            return tuple(_convert(x, kind, f"{field}[{i}]") for i, (x, kind) in enumerate(items))
+    elif kind is float and type(value) is int:
         return float(value)
-    if kind not in (bool, int, float, str, Path):
-        raise TypeError(f"{field}: fields of type {kind} cannot be read from YAML")
-    if type(value) is not kind:
-        raise _mismatch(value, kind, field)
-    return value
+    elif kind is Path and isinstance(value, str):
+        return Path(value)
+    elif type(value) is kind:
+        return value
+    raise _mismatch(value, kind, field)
 
 
 def _convert_dataclass(value: Any, cls: Any, field: str, base: Any = None) -> Any:
@@ -241,25 +206,23 @@ def _convert_dataclass(value: Any, cls: Any, field: str, base: Any = None) -> An
     if not isinstance(value, dict):
         raise _mismatch(value, cls, field)
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
-    for key in value:
-        if key in (gone := getattr(cls, "GONE", {})):
-            raise _MismatchError(f"{_join(field, key)}: {gone[key]}")
+    kinds, gone = get_type_hints(cls), getattr(cls, "GONE", {})
+    converted = {}
+    for key, item in value.items():
+        place = _join(field, key)
         if key not in fields:
-            expected = choices(str(key), fields)
-            raise _MismatchError(f"{_join(field, key)}: unknown key, expected {expected}")
+            said = gone.get(key) or f"unknown key, expected {choices(str(key), fields)}"
+            raise _MismatchError(f"{place}: {said}")
+        inner = getattr(base, key, fields[key].default)
+        if isinstance(item, dict) and dataclasses.is_dataclass(inner):
+            converted[key] = _convert_dataclass(item, type(inner), place, inner)
+        else:
+            converted[key] = _convert(item, kinds[key], place)
     for name, f in fields.items():
         no_default = f.default is f.default_factory is dataclasses.MISSING
         if base is None and no_default and name not in value:
-            expected = _describe(get_type_hints(cls)[name])
+            expected = _describe(kinds[name])
             raise _MismatchError(f"{_join(field, name)}: missing, expected {expected}")
-    kinds = get_type_hints(cls)
-    converted = {}
-    for key, item in value.items():
-        kind, inner = kinds[key], getattr(base, key, fields[key].default)
-        if dataclasses.is_dataclass(kind) and isinstance(inner, cast(type, kind)):
-            converted[key] = _convert_dataclass(item, kind, _join(field, key), inner)
-        else:
-            converted[key] = _convert(item, kind, _join(field, key))
     try:
         return dataclasses.replace(base, **converted) if base else cls(**converted)
     except ValueError as error:

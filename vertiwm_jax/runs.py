@@ -6,11 +6,10 @@ import json
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
-from types import TracebackType
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, Self
 
 import rich.progress
 from rich.console import Console
@@ -20,29 +19,25 @@ from vertiwm_jax.errors import UserError
 from vertiwm_jax.trackers import Events
 
 METRICS = "metrics.jsonl"
+SECONDS_BETWEEN_LINES = 15.0
+"""Of progress, where there is no terminal."""
 
 
 class RunError(UserError):
     """A run folder that cannot be read or written; the message names the path."""
 
 
-class Resumable(Protocol):
-    """Settings, a dataclass, of a command whose runs can be resumed.
-
-    runs: folder of runs; resume: folder of the run to resume.
-    """
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    @property
-    def runs(self) -> Path: ...
-
-    @property
-    def resume(self) -> Path | None: ...
+@contextlib.contextmanager
+def _refused(action: str) -> Iterator[None]:
+    """What the system refuses raises `RunError`; action: what could not be done, and where."""
+    try:
+        yield
+    except OSError as error:
+        raise RunError(f"{action}: {error}") from error
 
 
 class Run:
-    """One run's folder: `config.yaml`, `metrics.jsonl`, TensorBoard events, and what doors add.
+    """One run's folder: `config.yaml`, `metrics.jsonl`, TensorBoard events, and what commands add.
 
     Made by `Run.create` and continued by `Run.open`. `outermost` is the folder to resume: that of
     the run that this one is a `part` of, or its own.
@@ -62,10 +57,8 @@ class Run:
         A folder that cannot be made or written raises `RunError`.
         """
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-        try:
+        with _refused(f"{root}: cannot start a run there"):
             return cls._begin(_make_folder(Path(root), f"{name}-{stamp}"), settings)
-        except OSError as error:
-            raise RunError(f"{root}: cannot start a run there: {error}") from error
 
     @classmethod
     def open(cls, folder: str | Path, step: int, settings: Any) -> Self:
@@ -78,21 +71,19 @@ class Run:
         kept = [entry for entry in read_metrics(folder) if entry["step"] <= step]
         atomic.write(folder / METRICS, "".join(json.dumps(entry) + "\n" for entry in kept))
         atomic.write(folder / "config.yaml", config.dump(settings))
-        try:
+        with _refused(f"{folder}: cannot continue the run"):
             events = Events(folder)
             events.restart(step + 1)
-        except OSError as error:
-            raise RunError(f"{folder}: cannot continue the run: {error}") from error
         return cls(folder, events)
 
     @classmethod
-    def begin(
-        cls, settings: Resumable, name: str, step: int = 0, project: str | None = None
-    ) -> Self:
+    def begin(cls, settings: Any, name: str, step: int = 0, project: str | None = None) -> Self:
         """Create a run with these settings, or continue the one that they name from `step`.
 
         Of several hosts only the first keeps a folder; the others have temporary ones.
-        project: of Weights & Biases, which gets the metrics too; may raise `TrackingError`.
+        settings: a dataclass with `runs`, the folder of runs, and `resume`, that of the run to
+        continue, or None. project: of Weights & Biases, which gets the metrics too; may raise
+        `TrackingError`.
         """
         kept = dataclasses.replace(settings, resume=None)
         if project:
@@ -107,14 +98,12 @@ class Run:
     def part(self, name: str, step: int, settings: Any) -> Self:
         """A run in the folder `name` inside this one: made, or continued like `open` does."""
         folder = self.folder / name
-        try:
+        with _refused(f"{folder}: cannot start a run there"):
             if (folder / METRICS).is_file():
                 part = self.open(folder, step, settings)
             else:
                 folder.mkdir(exist_ok=True)
                 part = self._begin(folder, settings)
-        except OSError as error:
-            raise RunError(f"{folder}: cannot start a run there: {error}") from error
         part.outermost = self.outermost
         part._track(self._project, settings)
         return part
@@ -140,10 +129,8 @@ class Run:
         values = {name: float(value) for name, value in metrics.items()}
         path = self.folder / METRICS
         _append(path, json.dumps({"step": int(step), "wall_time": round(now, 3), **values}) + "\n")
-        try:
+        with _refused(f"{self.folder}: cannot write TensorBoard events"):
             self._events.log(int(step), now, values)
-        except OSError as error:
-            raise RunError(f"{self.folder}: cannot write TensorBoard events: {error}") from error
         if self._tracker:
             self._tracker.log(values, step=int(step))
 
@@ -151,28 +138,16 @@ class Run:
         """Close the TensorBoard file; `metrics.jsonl` is always complete."""
         if self._tracker:
             self._tracker.finish()
-        try:
+        with _refused(f"{self.folder}: cannot write TensorBoard events"):
             self._events.close()
-        except OSError as error:
-            raise RunError(f"{self.folder}: cannot write TensorBoard events: {error}") from error
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
         # After a failed write the file cannot be flushed either: the first error is the news.
         with contextlib.suppress(RunError) if error else contextlib.nullcontext():
             self.close()
-
-    @staticmethod
-    def progress(total: int, description: str) -> "Progress":
-        """A progress display of `total` units, to be used as a context manager."""
-        return Progress(total, description)
 
 
 class Progress:
@@ -181,17 +156,13 @@ class Progress:
     Use as a context manager and call `advance`.
     """
 
-    def __init__(self, total: int, description: str, seconds_between_lines: float = 15.0) -> None:
-        self._total = total
-        self._description = description
-        self._interval = seconds_between_lines
+    def __init__(self, total: int, description: str) -> None:
+        self._total, self._description, self._done = total, description, 0
         self._console = Console()
-        self._done = 0
         self._bar = rich.progress.Progress(
             rich.progress.TextColumn("{task.description}"),
             rich.progress.BarColumn(),
             rich.progress.TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
-            _RateColumn(),
             rich.progress.TimeRemainingColumn(),
             rich.progress.TextColumn("{task.fields[note]}"),
             console=self._console,
@@ -210,28 +181,19 @@ class Progress:
     def advance(self, amount: int = 1, note: str = "") -> None:
         """Count `amount` more units as done; `note` is shown beside the rate."""
         self._done += amount
-        self._bar.update(self._task, advance=amount, note=note)
         now = time.monotonic()
-        due = now - self._last >= self._interval or self._done >= self._total
+        rate = self._done / max(now - self._start, 1e-9)
+        pace = f"{1 / rate:,.0f} s each" if 0 < rate < 1 else f"{rate:,.0f}/s"
+        self._bar.update(self._task, advance=amount, note=f"{pace}  {note}")
+        due = now - self._last >= SECONDS_BETWEEN_LINES or self._done >= self._total
         if due and not self._console.is_terminal:
             self._last = now
-            rate = self._done / max(now - self._start, 1e-9)
             left = max(self._total - self._done, 0) / max(rate, 1e-9)
             print(
-                f"{self._description} {self._done:,}/{self._total:,}  {_pace(rate)}  "
+                f"{self._description} {self._done:,}/{self._total:,}  {pace}  "
                 f"{left:,.0f} s left  {note}".rstrip(),
                 flush=True,
             )
-
-
-class _RateColumn(rich.progress.ProgressColumn):
-    def render(self, task: rich.progress.Task) -> str:
-        return _pace(task.speed or 0.0)
-
-
-def _pace(rate: float) -> str:
-    """The rate a second, or the time of each if that is slower than one a second."""
-    return f"{1 / rate:,.0f} s each" if 0 < rate < 1 else f"{rate:,.0f}/s"
 
 
 def read_metrics(folder: str | Path) -> list[dict[str, float]]:
@@ -268,21 +230,17 @@ def read_columns(folder: str | Path) -> dict[str, list[float]]:
 
 def _append(path: Path, line: str) -> None:
     """Append one line; a write that fails midway is undone."""
-    try:
+    with _refused(f"{path}: cannot append metrics"):
         descriptor = os.open(path, os.O_WRONLY | os.O_APPEND)
+        length, data = os.fstat(descriptor).st_size, line.encode()
         try:
-            length = os.fstat(descriptor).st_size
-            data = line.encode()
-            try:
-                while data:
-                    data = data[os.write(descriptor, data) :]
-            except BaseException:
-                os.ftruncate(descriptor, length)
-                raise
+            while data:
+                data = data[os.write(descriptor, data) :]
+        except BaseException:
+            os.ftruncate(descriptor, length)
+            raise
         finally:
             os.close(descriptor)
-    except OSError as error:
-        raise RunError(f"{path}: cannot append metrics: {error}") from error
 
 
 def _make_folder(root: Path, name: str) -> Path:

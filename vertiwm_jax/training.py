@@ -21,7 +21,7 @@ from jax.sharding import Mesh
 from vertiwm_jax import checkpoints, hosts, machine, parallel, xla
 from vertiwm_jax.config import Count, settings
 from vertiwm_jax.errors import TrainingInterrupted, UserError
-from vertiwm_jax.runs import Run
+from vertiwm_jax.runs import Progress, Run
 
 State = TypeVar("State")
 _log = logging.getLogger(__name__)
@@ -216,7 +216,7 @@ def train(
         checkpoints.save(folder, done, whole, config.keep)
         saved(whole)
 
-    with _interruptible() as interrupted, run.progress(total, "training") as progress:
+    with _interruptible() as interrupted, Progress(total, "training") as progress:
         while done < iterations and not hosts.on_any(bool(interrupted)):
             start = time.perf_counter()
             state, metrics = iterate(data, state)

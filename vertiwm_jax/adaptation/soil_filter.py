@@ -63,10 +63,10 @@ class SoilFilter:
     """Steps that it then predicts, H."""
     prior: Positive = 1.5
     """Standard deviation of what the map says, in logits."""
-    memory: Annotated[float, Bounds(0, 1, above=True)] = 0.98
+    memory: Annotated[float, Bounds("more than 0 and at most 1", lambda x: 0 < x <= 1)] = 0.98
     """Share of a deviation from the map that a measurement leaves to the next one; the rest is
     forgotten, and what is known grows uncertain in step."""
-    noise: Annotated[tuple[float, float, float, float, float, float], Bounds(0, above=True)] = (
+    noise: tuple[Positive, Positive, Positive, Positive, Positive, Positive] = (
         0.05,
         0.05,
         0.02,

@@ -11,22 +11,23 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.config import Bounds, settings
+from vertiwm_jax.config import Bounds, CountOrZero, settings
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 
 _STRENGTH = "kc", "kphi", "cohesion"
+_Factor = Annotated[float, Bounds("at least 0.01", lambda x: x >= 0.01)]
 
 
 @settings
 class RandomizationConfig:
     """Bounds of what each episode draws uniformly; nothing varies by default."""
 
-    grip: Annotated[tuple[float, float], Bounds(0.01)] = (1.0, 1.0)
+    grip: tuple[_Factor, _Factor] = (1.0, 1.0)
     """Factor on the friction of rigid ground."""
-    soil: Annotated[tuple[float, float], Bounds(0.01)] = (1.0, 1.0)
+    soil: tuple[_Factor, _Factor] = (1.0, 1.0)
     """Factor on stiffness and cohesion of all soils."""
-    delay: Annotated[tuple[int, int], Bounds(0)] = (0, 0)
+    delay: tuple[CountOrZero, CountOrZero] = (0, 0)
     """Delay of commands, in steps of 0.1 s."""
 
     def check(self):

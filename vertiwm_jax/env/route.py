@@ -42,7 +42,7 @@ class RouteConfig:
     blocked: extra cost of a metre that touches an obstacle or the edge of the map.
     """
 
-    cells: Annotated[int, Bounds(4)] = 64
+    cells: Annotated[int, Bounds("at least 4", lambda x: x >= 4)] = 64
     difficulty: TraversabilityCost = TraversabilityCost()
     detour: NotNegative = 2.0
     blocked: NotNegative = 10.0

@@ -1,6 +1,7 @@
 """How well a policy drives in a simulator outside jit: the same task, a vehicle a process."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -21,10 +22,10 @@ from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import Task, TaskConfig
 from vertiwm_jax.runs import Progress
-from vertiwm_jax.simulators import chrono, following
+from vertiwm_jax.simulators import chrono
 from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.simulators.driving import drive
-from vertiwm_jax.simulators.following import AgentPilot
+from vertiwm_jax.simulators.following import AgentPilot, Followed
 from vertiwm_jax.simulators.processes import Map
 from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.terrain.map import TerrainMap
@@ -66,7 +67,7 @@ def evaluate(
 
     mapped: of `processes.simulating`; tasks: of which `params` has the starts.
     """
-    env, agent = following.followed(env), as_agent(agent)
+    env, agent = replace(env, dynamics=Followed()), as_agent(agent)
     own = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(params.pool_size))
     shared = jax.device_get((tasks, params, agent, jax.random.key_data(own)))
     one, driven = partial(_drive, simulator, env, *shared), []

@@ -79,8 +79,8 @@ def _observe(params: SimulatorParams, terrain: TerrainMap, moving: _Moving) -> O
     rotation = geometry.rotation_from_rpy(state.rpy).as_matrix()
     in_body = jnp.concatenate([vehicle.wheel_position, history.travel[:, None]], axis=-1)
     # Written out: a matmul may round map coordinates to ten bits on an accelerator.
-    centre = state.position + jnp.sum(rotation * in_body[:, None, :], axis=-1)
-    wheel_class, depth = under_wheels(terrain, centre, vehicle.wheel_radius)
+    center = state.position + jnp.sum(rotation * in_body[:, None, :], axis=-1)
+    wheel_class, depth = under_wheels(terrain, center, vehicle.wheel_radius)
     wheels = WheelSignals(
         wheel_omega=history.wheel_speed,
         wheel_sinkage=depth,

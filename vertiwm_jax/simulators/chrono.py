@@ -1,6 +1,6 @@
 """Drives Project Chrono's HMMWV, headless, on rigid, soft and mixed ground.
 
-Written for PyChrono 9.0, and like the program that recorded `data/open` with 9.0.1: rigid tyres,
+Written for PyChrono 9.0, and like the program that recorded `data/open` with 9.0.1: rigid tires,
 locked differentials, SCM soil near the wheels alone, 5 ms steps.
 """
 
@@ -96,7 +96,7 @@ def _observed(
     terrain: TerrainMap, pose: jax.Array, twist: jax.Array, wheels: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """State `[12]`, classes and sinkages `[4]`, from position and quaternion `[7]`, velocity in
-    the world and angular velocity in the body `[6]`, and wheel centres `[4, 3]`."""
+    the world and angular velocity in the body `[6]`, and wheel centers `[4, 3]`."""
     rotation = jaxlie.SO3(pose[3:])
     velocity = rotation.inverse() @ twist[:3]
     rpy = geometry.rpy_from_rotation(rotation)
@@ -128,7 +128,7 @@ class _Drive:
         self._probes: list[Any] = []
         if self._scm:
             self._add_soil_windows()
-        # Rigid tyres touch the ground through the collision system; the terrain passed to
+        # Rigid tires touch the ground through the collision system; the terrain passed to
         # Synchronize only feeds slip read-outs nobody uses, so it is something cheap.
         self._flat = vehicle.FlatTerrain(-100.0)
         self._inputs = vehicle.DriverInputs()

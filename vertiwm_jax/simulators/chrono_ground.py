@@ -90,11 +90,11 @@ class Ground:
                     top, bottom, left, right = i0 * down, i1 * down, j0 * across, j1 * across
                     image = self._image(folder, slice(top, bottom + 1), slice(left, right + 1))
                     x, y = spacing * (left + right) / 2, spacing * (top + bottom) / 2
-                    centre = chrono.ChVector3d(
+                    center = chrono.ChVector3d(
                         float(x - self.size[0] / 2), float(self.size[1] / 2 - y), 0.0
                     )
                     rigid.AddPatch(
-                        material, chrono.ChCoordsysd(centre, chrono.QUNIT), image,
+                        material, chrono.ChCoordsysd(center, chrono.QUNIT), image,
                         float(spacing * (right - left)), float(spacing * (bottom - top)),
                         self._low, self._high, True, 0.0, False,
                     )  # fmt: skip
@@ -179,26 +179,12 @@ class Ground:
 
 
 def rectangles(mask: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
-    """Covers a mask with rectangles (i0, i1, j0, j1), half open, largest first."""
+    """Covers a mask with rectangles (i0, i1, j0, j1), half open: each as wide, then as high as may
+    be from the first cell that is left."""
     left = mask.copy()
     while left.any():
-        i0, i1, j0, j1 = _largest_rectangle(left)
+        i0, j0 = np.argwhere(left)[0].tolist()
+        j1 = j0 + int(np.argmin(np.append(left[i0, j0:], False)))
+        i1 = i0 + int(np.argmin(np.append(left[i0:, j0:j1].all(axis=1), False)))
         left[i0:i1, j0:j1] = False
         yield i0, i1, j0, j1
-
-
-def _largest_rectangle(mask: np.ndarray) -> tuple[int, int, int, int]:
-    best, area = (0, 0, 0, 0), 0
-    run = np.zeros(mask.shape[1], int)
-    for i, row in enumerate(mask):
-        run = np.where(row, run + 1, 0)
-        for j0 in np.flatnonzero(run):
-            low = run[j0]
-            for j1 in range(j0, len(run)):
-                low = min(low, run[j1])
-                if low == 0:
-                    break
-                if low * (j1 - j0 + 1) > area:
-                    area = low * (j1 - j0 + 1)
-                    best = (int(i - low + 1), i + 1, int(j0), j1 + 1)
-    return best

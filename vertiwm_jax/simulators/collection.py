@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -22,7 +22,7 @@ from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.learning import schema
 from vertiwm_jax.mechanics import vehicle
-from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig
+from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle
 from vertiwm_jax.models.registry import load_encoders
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.rl.policy import load_policy
@@ -75,7 +75,7 @@ class CollectConfig:
     """How many of each."""
     drives: Count = 25
     """Drives on each world; `fit` learns from the first 20, and tests on 22 to 24."""
-    seconds: Annotated[float, Bounds(STEP_SECONDS)] = 25.0
+    seconds: Annotated[float, Bounds("at least 0.1", lambda x: x >= STEP_SECONDS)] = 25.0
     """Duration of a drive."""
     policy: Path | None = None
     """Run folder of a policy that drives from goal to goal; the paper's sinusoids by default."""
@@ -120,7 +120,7 @@ def collect(config: CollectConfig) -> None:
     tasks = (
         Task(config, driven.vehicle, learned, alone, world, drive)
         for world in missing
-        for alone in [jax.device_get(terrain.subset(np.array([world])))]
+        for alone in [_alone(terrain, world)]
         for drive in range(config.drives)
     )
     total = len(missing) * config.drives * config.steps
@@ -134,8 +134,18 @@ def collect(config: CollectConfig) -> None:
                 drives.append(drive)
                 done += len(drive.control)
                 progress.advance(config.steps, f"world {world}, drive {len(drives)}")
-            alone = jax.device_get(terrain.subset(np.array([world])))
-            _write(config, driven, world, alone, drives)
+            path = _file(config, world)
+            files.save(_alone(terrain, world), path.parent / "maps" / path.name)
+            meta = {
+                "map": path.name,
+                "simulator": config.simulator,
+                "scale": driven.scale,
+                "policy": str(config.policy) if config.policy else "sinusoids",
+                "world": world,
+                "seed": config.seed,
+            }
+            # Last, because by its file a world counts as done.
+            write(path, drives, config.steps, meta, driven.vehicle)
     if done:
         _log.info("%s steps, %.0f a second", f"{done:,}", done / (time.monotonic() - began))
 
@@ -198,8 +208,8 @@ def _claim(config: CollectConfig) -> None:
         (config.output / "maps").mkdir(parents=True, exist_ok=True)
         atomic.write(file, configuration.dump(asked))
     before = configuration.load(CollectConfig, file)
-    for name in (field.name for field in fields(CollectConfig)):
-        was, found = getattr(before, name), getattr(asked, name)
+    for name, found in vars(asked).items():
+        was = getattr(before, name)
         if was != found:
             raise ConfigError(f"{file}: {name}: expected {was} as before, found {found}")
 
@@ -208,25 +218,9 @@ def _file(config: CollectConfig, world: int) -> Path:
     return config.output / f"world_{world:03d}.npz"
 
 
-def _write(
-    config: CollectConfig,
-    driven: VehicleConfig,
-    world: int,
-    terrain: TerrainMap,
-    drives: list[Drive],
-) -> None:
-    """The map, and then the drives, by which a world counts as done."""
-    path = _file(config, world)
-    files.save(terrain, path.parent / "maps" / path.name)
-    meta = {
-        "map": path.name,
-        "simulator": config.simulator,
-        "scale": driven.scale,
-        "policy": str(config.policy) if config.policy else "sinusoids",
-        "world": world,
-        "seed": config.seed,
-    }
-    write(path, drives, config.steps, meta, driven.vehicle)
+def _alone(terrain: TerrainMap, world: int) -> TerrainMap:
+    """One world of several, in host memory."""
+    return jax.device_get(terrain.subset(np.array([world])))
 
 
 def record(
@@ -240,8 +234,7 @@ def record(
 
     terrain: what the simulator drives on. A state that diverged is left out.
     """
-    low, high = within(terrain, MARGIN)
-    return drive(simulator, start, pilot, steps, partial(_ending, low, high))
+    return drive(simulator, start, pilot, steps, partial(_ending, *within(terrain, MARGIN)))
 
 
 def to_goals(
@@ -288,11 +281,10 @@ def write(
 
 
 def _arrays(drive: Drive) -> dict[str, np.ndarray]:
-    """Arrays of the schema `[T + 1, ...]`, of the control `[T, 2]`."""
+    """A drive as arrays of the schema."""
     seen = jax.tree.map(lambda *x: np.stack(x), *drive.observations)
-    arrays = {"state": seen.state, "control": drive.control, "wheel_class": seen.wheel_class}
-    known = {name: getattr(seen.wheels, name) for name in schema.WHEEL_SIGNALS}
-    return arrays | {name: array for name, array in known.items() if array is not None}
+    known = {name: x for name, x in vars(seen.wheels).items() if x is not None}
+    return schema.drive(seen.state, drive.control, wheel_class=seen.wheel_class, **known)
 
 
 def _ending(low: np.ndarray, high: np.ndarray, state: np.ndarray) -> Ending | None:

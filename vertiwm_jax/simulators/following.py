@@ -1,6 +1,6 @@
 """The navigation task of a vehicle that a simulator outside jit moves, and agents that drive it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -10,11 +10,8 @@ import numpy as np
 
 from vertiwm_jax.env.agent import Agent, Memory, Now
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.route import Routes
 from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason
-from vertiwm_jax.mechanics.vehicle import Vehicle
-from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -37,11 +34,6 @@ class Followed:
         return VehicleState.from_vector(params), ()
 
 
-def followed(env: NavigationEnv) -> NavigationEnv:
-    """The same task, with the vehicle moved from outside."""
-    return replace(env, dynamics=Followed())
-
-
 class AgentPilot:
     """An agent that commands a vehicle in a simulator outside jit, see `driving.drive`.
 
@@ -60,7 +52,7 @@ class AgentPilot:
         """`AgentPilot` of one episode, or of a drive from goal to goal.
 
         Args:
-            env: the task, as `followed` gives it.
+            env: the task, with the dynamics `Followed`.
             task: what it is run with.
             agent: what drives.
             start: a start of the pool, whose vehicle is replaced by the one that is seen.
@@ -77,11 +69,11 @@ class AgentPilot:
     def __call__(self, seen: np.ndarray) -> np.ndarray | None:
         """The command `[2]` at the state `[12]` that the vehicle is in; None once all is over."""
         env, vehicle = self._env, jnp.asarray(seen)
-        task = moved(self._task, vehicle)
-        step, first = len(self.path), self._action is None
+        task = replace(self._task, dynamics=vehicle)
+        step = len(self.path)
         plan_key, act_key = jax.random.split(jax.random.fold_in(self._key, step))
-        if first:
-            now = _begin(env, task, self.state, vehicle)
+        if self._action is None:
+            now = begin(env, task, self.state, vehicle)
         else:
             now = _follow(env, task, self.state, self._action, act_key)
         if self._next_goal:
@@ -90,13 +82,12 @@ class AgentPilot:
         self.path.append(np.concatenate([now.state.vehicle.position, now.state.vehicle.rpy]))
         if now.state.ending != TerminationReason.RUNNING:
             return None
-        if first:
+        if self._action is None:
             self._memory = _init(self._agent, now)
-        if step % self._agent.interval == 0:
-            self._memory = _plan(self._agent, now, self._memory, plan_key)
-        action, self._memory = _act(self._agent, now, self._memory, act_key)
+        plans, keys = step % self._agent.interval == 0, (plan_key, act_key)
+        action, self._memory = _decide(self._agent, now, self._memory, keys, plans)
         self._action = action
-        return _command(env, task, action)
+        return command(env, task, action)
 
     def _from_goal_to_goal(self, now: Now, draw: Callable[[np.ndarray], np.ndarray]) -> Now:
         """The same, as if the episode had begun here, with another goal where one is reached."""
@@ -106,42 +97,16 @@ class AgentPilot:
         if np.linalg.norm(state.goal - place) >= config.goal_radius:
             return replace(now, state=state)
         goal = jnp.asarray(draw(place[:2]), jnp.float32)
-        routes = _route(config, now.task.terrain.select(state.world), now.task.vehicle, goal[:2])
+        terrain = now.task.terrain.select(state.world)
+        routes = _route(config, terrain, now.task.vehicle, goal[:2])
         self._task = replace(self._task, routes=routes)
-        task, state = replace(now.task, routes=routes), replace(state, goal=goal, route=zero)
-        return Now(task, state, _observe(self._env, task, state))
-
-
-def start(
-    simulator: Simulator,
-    env: NavigationEnv,
-    task: TaskParams,
-    state: TaskState,
-    pose: Sequence[float],
-) -> tuple[jax.Array, TaskState]:
-    """Observation and state of an episode whose vehicle stands in `simulator`.
-
-    state: a start of the pool, whose vehicle is replaced; pose: `[3]` x, y, m, and yaw, rad.
-    """
-    seen = jnp.asarray(simulator.start(*pose).state)
-    now = _begin(env, moved(task, seen), state, seen)
-    return now.observation, now.state
-
-
-def move(
-    simulator: Simulator, env: NavigationEnv, task: TaskParams, action: jax.Array
-) -> TaskParams:
-    """Does the action `[2]` in `simulator`; `Followed` does the same with these parameters."""
-    return moved(task, jnp.asarray(simulator.step(_command(env, task, action)).state))
-
-
-def moved(task: TaskParams, state: jax.Array) -> TaskParams:
-    """Parameters by which `Followed` moves the vehicle to a state `[12]`."""
-    return replace(task, dynamics=state)
+        state = replace(state, goal=goal, route=zero)
+        return begin(self._env, replace(now.task, routes=routes), state, now.task.dynamics)
 
 
 @partial(jax.jit, static_argnames="env")
-def _begin(env: NavigationEnv, task: TaskParams, state: TaskState, seen: jax.Array) -> Now:
+def begin(env: NavigationEnv, task: TaskParams, state: TaskState, seen: jax.Array) -> Now:
+    """An episode whose vehicle is in the state `[12]` that is seen, not in that of `state`."""
     vehicle, terrain = VehicleState.from_vector(seen), task.terrain.select(state.world)
     history = env.dynamics.init(task.dynamics, terrain, vehicle)
     state = replace(state, vehicle=vehicle, history=history)
@@ -157,16 +122,7 @@ def _follow(
     return Now(task, state, observation)
 
 
-@partial(jax.jit, static_argnames="env")
-def _observe(env: NavigationEnv, task: TaskParams, state: TaskState) -> jax.Array:
-    return env.observe(None, state, None, task)
-
-
-@partial(jax.jit, static_argnames="config")
-def _route(
-    config: NavigationConfig, terrain: TerrainMap, vehicle: Vehicle, goal: jax.Array
-) -> Routes:
-    return config.route_to(terrain, vehicle, goal)
+_route = jax.jit(NavigationConfig.route_to, static_argnums=0)
 
 
 @jax.jit
@@ -174,16 +130,15 @@ def _init(agent: Agent, now: Now) -> Memory:
     return agent.init(now)
 
 
-@jax.jit
-def _plan(agent: Agent, now: Now, memory: Memory, key: jax.Array) -> Memory:
-    return agent.plan(now, memory, key)
-
-
-@jax.jit
-def _act(agent: Agent, now: Now, memory: Memory, key: jax.Array) -> tuple[jax.Array, Memory]:
-    action, memory = agent.act(now, memory, key)
+@partial(jax.jit, static_argnames="plans")
+def _decide(
+    agent: Agent, now: Now, memory: Memory, keys: tuple[jax.Array, jax.Array], plans: bool
+) -> tuple[jax.Array, Memory]:
+    """The action `[2]`, and the memory after it; plans: whether a plan is due before."""
+    memory = agent.plan(now, memory, keys[0]) if plans else memory
+    action, memory = agent.act(now, memory, keys[1])
     return jnp.clip(action, -1.0, 1.0), memory
 
 
-def _command(env: NavigationEnv, task: TaskParams, action: jax.Array) -> np.ndarray:
+def command(env: NavigationEnv, task: TaskParams, action: jax.Array) -> np.ndarray:
     return np.asarray(task.vehicle.command(action, env.config.speed_range).vector)

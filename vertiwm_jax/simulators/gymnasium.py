@@ -14,7 +14,7 @@ from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import NavigationConfig, TaskState
 from vertiwm_jax.simulators import following
 from vertiwm_jax.simulators.following import Followed
-from vertiwm_jax.simulators.protocol import Simulator
+from vertiwm_jax.simulators.protocol import Observation, Simulator
 from vertiwm_jax.terrain.map import TerrainMap
 
 
@@ -42,14 +42,18 @@ class SimulatorEnv(NavigationGymEnv):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """As `NavigationGymEnv.step`."""
         if self._state is not None:
-            self._params = following.move(
-                self._simulator, self._env, self._params, jnp.asarray(action)
-            )
+            command = following.command(self._env, self._params, jnp.asarray(action))
+            self._moved_to(self._simulator.step(command))
         return super().step(action)
 
     def _start(self) -> tuple[jax.Array, TaskState]:
         _, state = super()._start()
         self._simulator = self._make(self._params.terrain.select(state.world))
         x, y, _ = state.vehicle.position.tolist()
-        pose = (x, y, float(state.vehicle.rpy[2]))
-        return following.start(self._simulator, self._env, self._params, state, pose)
+        self._moved_to(self._simulator.start(x, y, float(state.vehicle.rpy[2])))
+        now = following.begin(self._env, self._params, state, self._params.dynamics)
+        return now.observation, now.state
+
+    def _moved_to(self, seen: Observation) -> None:
+        """The vehicle is where the simulator has moved it."""
+        self._params = replace(self._params, dynamics=jnp.asarray(seen.state))

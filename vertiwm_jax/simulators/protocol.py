@@ -26,7 +26,7 @@ class SimulatorError(UserError):
 class Observation:
     """The observed state of one vehicle, in NumPy arrays.
 
-    state: `[12]` as `VehicleState.vector`, of the body origin between the wheel centres.
+    state: `[12]` as `VehicleState.vector`, of the body origin between the wheel centers.
     wheel_class: `[4]` uint8, ground class under each wheel.
     wheels: state of the wheels, where known; forces are means over the last step.
     """
@@ -49,16 +49,16 @@ class Simulator(Protocol):
 
 
 def under_wheels(
-    terrain: TerrainMap, centre: jax.Array, radius: jax.Array
+    terrain: TerrainMap, center: jax.Array, radius: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Ground class `[4]` uint8 under wheels, and how deep they reach below the map `[4]`, m.
 
-    centre: `[4, 3]` of the wheels, world frame, m; radius: `[]` m. The depth is along the normal
+    center: `[4, 3]` of the wheels, world frame, m; radius: `[]` m. The depth is along the normal
     of the undeformed ground, as in the recorded drives; negative in the air.
     """
     around = _TYRE * jnp.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], jnp.float32)
-    ground = query.surface(terrain, centre[:, None, :2] + around)
+    ground = query.surface(terrain, center[:, None, :2] + around)
     middle, east, west, north, south = jnp.moveaxis(ground.height, -1, 0)
     slope_x, slope_y = (east - west) / (2 * _TYRE), (north - south) / (2 * _TYRE)
-    depth = radius - (centre[:, 2] - middle) / jnp.sqrt(1 + slope_x**2 + slope_y**2)
+    depth = radius - (center[:, 2] - middle) / jnp.sqrt(1 + slope_x**2 + slope_y**2)
     return ground.semantic[:, 0].astype(jnp.uint8), depth

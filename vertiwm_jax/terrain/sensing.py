@@ -15,6 +15,7 @@ from vertiwm_jax.terrain.map import ObservedMap, TerrainMap
 NEAR = 4.0
 """Distance, m, within which a vehicle knows the ground in all directions."""
 _RINGS, _DIRECTIONS = 6, 12  # of the places in view that the plane is laid through
+_Angle = Bounds("more than 0 and at most 6.28319", lambda x: 0 < x <= 2 * math.pi)
 
 
 @settings
@@ -23,7 +24,7 @@ class SensingConfig:
 
     range: Positive = math.inf
     """Distance, m, at which ground, and obstacles by their middle, are seen."""
-    field_of_view: Annotated[float, Bounds(0, 2 * math.pi, above=True)] = 2 * math.pi
+    field_of_view: Annotated[float, _Angle] = 2 * math.pi
     """Angle of view, rad, centered ahead. Ground nearer than 4 m is always seen."""
     cells: Count = 64
     """Cells along each side of the map; each cell is known or not."""
