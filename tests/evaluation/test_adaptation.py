@@ -1,17 +1,10 @@
 from dataclasses import dataclass, replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import pytest
-from scipy.optimize import brentq
 
 from vertiwm_jax.adaptation.soil_filter import SoilFilter
 from vertiwm_jax.evaluation import adaptation
 from vertiwm_jax.learning.dataset import Drives, WheelSignals
-from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import GRAVITY, load_vehicle
-from vertiwm_jax.mechanics.wheel import Wheel
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import PRESETS, to_unit
@@ -49,23 +42,20 @@ def driven() -> Drives:
 def test_predictions_get_better_as_the_drive_goes_on():
     drives = driven()
     wrong = adaptation.mistaken(TERRAIN, PRESETS["snow"])
-    adapted = adaptation.adapt(SoilFilter(memory=1.0), Slowed(), None, wrong, drives)
+    beliefs = adaptation.adapt(SoilFilter(memory=1.0), Slowed(), None, wrong, drives)
     # Blocks of eight steps, of which the first has no history; none after the end of a drive.
-    np.testing.assert_array_equal(adapted.accepted[0, :, MUD], np.arange(10))
-    np.testing.assert_array_equal(adapted.accepted[1, :, MUD], np.minimum(np.arange(10), 5))
+    np.testing.assert_array_equal(beliefs.accepted[0, :, MUD], np.arange(10))
+    np.testing.assert_array_equal(beliefs.accepted[1, :, MUD], np.minimum(np.arange(10), 5))
     index = adaptation.windows_on_soil(drives, TERRAIN)
-    found = adaptation.errors(Slowed(), None, TERRAIN, wrong, adapted, drives, index)
-    means = {name: [x.mean for _, x in rows.values()] for name, rows in found.items()}
+    found = adaptation.compare(Slowed(), None, TERRAIN, wrong, drives, index, beliefs)
+    means = {row.name: [x.mean for x in row.final["position"].values()] for row in found}
     shares = [float(to_unit(PRESETS[name])[1]) for name in ("mud", "snow")]
     missed = 1.6 * 2.0 * (shares[0] - shares[1])
-    assert [n for n, _ in found["true"].values()] == [5, 1]
-    np.testing.assert_allclose(means["true"], 0, atol=1e-5)
-    np.testing.assert_allclose(means["wrong"], missed, rtol=1e-3)
-    assert means["wrong, adapted"][0] < 0.2 * missed
-    assert means["wrong, adapted"][1] < 0.05 * missed
-    table = adaptation.format_errors(found).splitlines()
-    assert table[2] == "| soils | 0 to 5 s (n = 5) | 5 to 10 s (n = 1) |"
-    assert table[5].startswith(f"| wrong | {missed:.3f} (")
+    assert found[0].count == {"0 to 5 s": 5, "5 to 10 s": 1}
+    np.testing.assert_allclose(means["true soils"], 0, atol=1e-5)
+    np.testing.assert_allclose(means["wrong soils"], missed, rtol=1e-3)
+    assert means["wrong soils, adapted"][0] < 0.2 * missed
+    assert means["wrong soils, adapted"][1] < 0.05 * missed
 
 
 def test_wrong_soils_are_those_of_soft_ground_alone():
@@ -74,33 +64,3 @@ def test_wrong_soils_are_those_of_soft_ground_alone():
     assert (np.asarray(wrong.soils.kphi)[0, soft] == PRESETS["snow"].kphi).all()
     same = np.asarray(wrong.soils.kphi == TERRAIN.soils.kphi)[0]
     assert same[~soft].all()
-
-
-def test_behaviour_is_that_under_a_quarter_of_the_weight():
-    params, soil = chrono_like(load_vehicle()), PRESETS["sand"]
-    vehicle = params.vehicle
-    sinkage, pull = adaptation.behaviour(params, soil)
-    stiff = replace(soil, kc=1.8 * soil.kc, kphi=1.8 * soil.kphi)
-    wheel = Wheel(vehicle.wheel_radius, vehicle.wheel_width)
-
-    def forces(z):
-        spin = 2.0 / 0.8 / vehicle.wheel_radius
-        return params.contact.forces(wheel, stiff, z, 2.0, 0.0, spin)
-
-    load = float(vehicle.mass) * GRAVITY / 4
-    expected = brentq(lambda z: float(forces(z).normal) - load, 1e-4, 0.3, xtol=1e-6)
-    assert float(sinkage) == pytest.approx(expected, rel=1e-3)
-    assert float(pull) == pytest.approx(float(forces(expected).longitudinal), rel=1e-3)
-
-
-def test_recovery_tells_what_the_soil_does():
-    wrong = adaptation.mistaken(TERRAIN, PRESETS["snow"])
-    count = np.zeros((2, 3, 10), int)
-    count[0, -1, MUD] = 9
-    soils = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 3, *x.shape)), query.soils(TERRAIN))
-    adapted = adaptation.Adapted(soils, count, 0 * count, 8)
-    (row,) = adaptation.recovery(chrono_like(load_vehicle()), TERRAIN, wrong, adapted)
-    assert row["soil"] == "mud" and row["drives"] == "1" and row["measurements, refused"] == "9, 0"
-    true, _, before = row["sinkage, mm: true / wrong"].partition(" / ")
-    assert float(true) < 0.5 * float(before)
-    assert row["sinkage, mm: adapted"] == f"{true} ({true} to {true})"

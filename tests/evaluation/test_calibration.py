@@ -21,13 +21,33 @@ def errors(seed, count=40_000):
     return (0.02 + 4 * disagreement) * random.exponential(size=count), disagreement
 
 
+def constant(error):
+    """One bound for all disagreements."""
+    return Calibration.measure(error, np.zeros_like(error))
+
+
+def covered(bounds, error, disagreement, order=None):
+    """For each level: it, how often its bound holds, and how often in each part."""
+    given = {"order": disagreement if order is None else order, "it": disagreement}
+    rows = calibration.coverage({"it": bounds}, error, given)
+    assert [row["bound for"] for row in rows] == ["50%", "80%", "90%", "95%"]
+    return [
+        (level, share(row["held for"]), [share(part) for part in row["by part"].split(" / ")])
+        for level, row in zip(LEVELS, rows, strict=True)
+    ]
+
+
+def share(text):
+    return float(text.rstrip("%")) / 100
+
+
 def test_bounds_hold_as_often_as_they_say_at_every_disagreement():
     found = Calibration.measure(*errors(0))
     assert (found.intercept, found.slope) == pytest.approx((0.02, 4.0), rel=0.25)
     error, disagreement = errors(1)
-    for row in calibration.coverage(found, error, disagreement, disagreement):
-        np.testing.assert_allclose(row.parts, row.level, atol=0.05)
-        assert row.held == pytest.approx(row.level, abs=0.02)
+    for level, held, parts in covered(found, error, disagreement):
+        np.testing.assert_allclose(parts, level, atol=0.05)
+        assert held == pytest.approx(level, abs=0.02)
 
 
 def test_the_quantiles_of_exponential_errors():
@@ -38,24 +58,22 @@ def test_the_quantiles_of_exponential_errors():
 
 
 def test_one_bound_for_all_holds_too_often_where_there_is_least_disagreement():
-    error, _ = errors(0)
-    found = Calibration.measure(error, None)
-    error, disagreement = errors(1)
-    for row in calibration.coverage(found, error, disagreement, disagreement):
-        assert row.held == pytest.approx(row.level, abs=0.02)
-        assert row.parts[0] > row.level > row.parts[-1]
+    found = constant(errors(0)[0])
+    for level, held, parts in covered(found, *errors(1)):
+        assert held == pytest.approx(level, abs=0.02)
+        assert parts[0] > level > parts[-1]
 
 
 def test_parts_are_fifths_in_the_order_of_disagreement():
     disagreement = np.array([5.0, 1.0, 4.0, 2.0, 3.0])
-    table = calibration.format_parts(10 * disagreement, disagreement)
-    assert "| mean error, m | 10.000 | 20.000 | 30.000 | 40.000 | 50.000 |" in table
+    rows = calibration.parts(10 * disagreement, disagreement)
+    assert [float(row["mean error, m"]) for row in rows] == [10, 20, 30, 40, 50]
 
 
 def test_the_picture_has_every_bound_and_how_often_it_held():
     (error, disagreement), tested = errors(0), errors(1, count=500)
-    known, constant = Calibration.measure(error, disagreement), Calibration.measure(error, None)
-    left, right = calibration.picture(known, *tested, constant).axes
+    known = Calibration.measure(error, disagreement)
+    left, right = calibration.picture(known, *tested, constant(error)).axes
     drawn = {line.get_label(): line.get_xydata() for line in left.lines}
     place, bound = drawn["bound for 90%"].T
     np.testing.assert_allclose(bound, known.bound(place, 0.9))
@@ -69,9 +87,9 @@ def test_the_picture_has_every_bound_and_how_often_it_held():
 def test_parts_can_be_ordered_by_something_else():
     error, disagreement = errors(0)
     found = Calibration.measure(error, disagreement)
-    ordered = calibration.coverage(found, error, disagreement, order=error)
-    assert ordered[1].parts[0] == 1.0 and ordered[1].parts[-1] < 0.5
-    assert ordered[1].held == pytest.approx(0.8, abs=0.01)
+    _, held, parts = covered(found, error, disagreement, order=error)[1]
+    assert parts[0] == 1.0 and parts[-1] < 0.5
+    assert held == pytest.approx(0.8, abs=0.01)
 
 
 @struct.dataclass
@@ -115,14 +133,14 @@ def test_errors_and_disagreement_are_those_of_the_predicted_steps():
     """Two of the context, and four predicted, in the last two of which they disagree."""
     error, found = calibration.signs(Standing(), jnp.float32(0.25), standing())
     np.testing.assert_allclose(error, [1, 2, 3], rtol=1e-6)
-    assert list(found) == ["gates", "specialists"]
+    assert list(found) == ["gates", "specialists", "nothing"]
     np.testing.assert_allclose(found["gates"], 0.25)
     np.testing.assert_allclose(found["specialists"], 0.5)
 
 
 def test_a_single_gate_tells_nothing():
     _, found = calibration.signs(Standing(gates=False), jnp.float32(0.25), standing())
-    assert list(found) == ["specialists"]
+    assert list(found) == ["specialists", "nothing"]
 
 
 def test_a_prediction_that_is_not_finite_is_an_error():

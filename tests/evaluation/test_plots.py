@@ -45,9 +45,9 @@ def test_trajectories_show_every_drive():
     assert said == [
         "learned",
         "straight to goal",
-        "goal, in a circle of 8 m",
         "end of a drive",
         "start",
+        "goal, in a circle of 8 m",
         "grass",
     ]
     assert overhead.get_title() == "world 0"
@@ -69,10 +69,10 @@ def test_learning_curves_draw_every_metric_of_every_run():
         for i in range(3)
     }
     labels = {"success": "success rate", "loss": "value loss"}
-    figure = plots.learning_curves(runs, "step", labels, "transitions")
-    assert [axes.get_ylabel() for axes in figure.axes] == ["success rate", "value loss"]
+    figure = plots.learning_curves(runs, "step", labels)
+    assert [axes.get_title() for axes in figure.axes] == ["success rate", "value loss"]
     np.testing.assert_array_equal(figure.axes[0].lines[2].get_ydata(), 2 * np.arange(5))
     del runs["seed 1"]["loss"]
-    figure = plots.learning_curves(runs, "step", labels, "transitions")
+    figure = plots.learning_curves(runs, "step", labels)
     assert np.isnan(figure.axes[1].lines[1].get_ydata()).all()
     figure.savefig(io.BytesIO())

@@ -40,14 +40,15 @@ def test_coefficients_are_aligned_where_the_vehicle_crosses_a_border():
 
 def test_pictures_of_predictions():
     path = np.stack([np.arange(5.0), 0.1 * np.arange(5.0)], axis=-1)
-    panels = [(f"window {i}", {"recorded": path, "model": 1.1 * path}) for i in range(5)]
-    figure = prediction_report.paths(panels)
+    windows = {f"window {i}": {"recorded": path, "model": 1.1 * path} for i in range(5)}
+    figure = prediction_report.paths(windows)
     recorded = figure.axes[0].lines[0].get_xydata()
     np.testing.assert_allclose(recorded, np.stack([-path[:, 1], path[:, 0]], axis=-1))
     assert [axes.axison for axes in figure.axes] == [True] * 5 + [False] * 3
     figure.savefig(io.BytesIO())
 
-    traces = {"onto soil": np.array([[0.5, 0.1], [np.nan, 0.2], [0.7, 0.3]])}
-    figure = prediction_report.coefficients(traces, ("planar", "yaw"), np.array([-0.1, 0.0, 0.1]))
-    np.testing.assert_array_equal(figure.axes[0].lines[1].get_ydata(), [0.1, 0.2, 0.3])
+    trace = np.array([[0.5, 0.1, 0.0, 0.0], [np.nan, 0.2, 0.0, 0.0], [0.7, 0.3, 0.0, 0.0]])
+    figure = prediction_report.coefficients({"onto soil": trace})
+    line = figure.axes[0].lines[1].get_xydata()
+    np.testing.assert_allclose(line, [[-0.1, 0.1], [0.0, 0.2], [0.1, 0.3]])
     figure.savefig(io.BytesIO())

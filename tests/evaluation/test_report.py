@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.episodes import NavigationResult
 from vertiwm_jax.env.termination import TerminationReason as Reason
 from vertiwm_jax.evaluation import report
@@ -39,7 +40,7 @@ def result(reached: list[int]) -> NavigationResult:
 def groups():
     results = {
         "learned": result([1, 1, 1, 0, 1, 0]),
-        "straight": result([0, 1, 1, 1, 0, 0]),
+        REFERENCE: result([0, 1, 1, 1, 0, 0]),
         "random": result([0, 0, 0, 0, 0, 0]),
     }
     return report.by_suite(results, SUITES)
@@ -55,37 +56,36 @@ def test_episodes_go_to_the_suite_of_their_world(groups):
 
 
 def test_summary_is_json_and_counts_rescues(groups):
-    summary = json.loads(json.dumps(report.summary(groups, "straight"), allow_nan=False))
+    summary = json.loads(json.dumps(report.summary(groups), allow_nan=False))
     hard, easy = summary["hard"], summary["easy"]
-    assert (hard["learned"]["successes"], hard["straight"]["successes"]) == (3, 1)
+    assert (hard["learned"]["successes"], hard[REFERENCE]["successes"]) == (3, 1)
     # Of the tasks 0, 4 and 5 that the reference fails, the learned policy solves 0 and 4.
     assert hard["learned"]["solved_of_reference_failures"] == 2
     assert easy["learned"]["solved_of_reference_failures"] == 0
-    assert easy["straight"]["solved_of_reference_failures"] == 0
+    assert easy[REFERENCE]["solved_of_reference_failures"] == 0
     assert hard["learned"]["seconds"] == pytest.approx(np.mean([1, 2, 5]), rel=1e-5)
     assert hard["random"]["seconds"] is None
     assert hard["random"]["endings"] == {"stuck": 4}
 
 
 def test_markdown_has_a_table_for_each_suite(groups):
-    text = report.markdown(groups, "straight")
+    text = report.markdown(groups)
     assert text.index("**hard**") < text.index("**easy**")
-    assert "Solved of the 3 tasks that straight fails: learned 2, random 0" in text
-    assert "Solved of the 0 tasks that straight fails: learned 0, random 0" in text
+    assert "Solved of the 3 tasks that straight to goal fails: learned 2, random 0" in text
+    assert "Solved of the 0 tasks that straight to goal fails: learned 0, random 0" in text
     rows = [line for line in text.splitlines() if line.startswith("| learned ")]
     assert [row.split("|")[2].strip() for row in rows] == ["3/4", "1/2"]
 
 
 def test_the_reference_alone_is_compared_with_nothing(groups):
-    text = report.markdown({"easy": {"straight": groups["easy"]["straight"]}}, "straight")
-    assert "| straight " in text and "Solved" not in text
+    text = report.markdown({"easy": {REFERENCE: groups["easy"][REFERENCE]}})
+    assert f"| {REFERENCE} " in text and "Solved" not in text
 
 
 def test_everything_is_written(groups, tmp_path):
-    terrain = terrain_map.stack(
-        [TerrainMap.from_array(np.zeros((65, 65)), np.zeros((8, 8), int))] * 3
-    )
-    report.write(tmp_path / "new", groups, "straight", terrain, 8.0)
+    level = TerrainMap.from_array(np.zeros((65, 65)), np.zeros((8, 8), int))
+    terrain = terrain_map.stack([level] * 3)
+    report.write(tmp_path / "new", groups, terrain, 8.0)
     left = {path.name for path in (tmp_path / "new").iterdir()}
     pictures = {"trajectories_hard.png", "trajectories_easy.png"}
     assert left == {"summary.md", "summary.json", "episodes.csv", *pictures}

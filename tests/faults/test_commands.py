@@ -12,7 +12,7 @@ from doors import door, refusal
 from faults.border import fault
 from learning import recordings
 
-from vertiwm_jax.cli import evaluate
+from vertiwm_jax.evaluation import calibration, prediction, report
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning import experiment as fitting
 from vertiwm_jax.learning.schema import DataError
@@ -73,9 +73,9 @@ def test_an_unwritable_output_is_refused_first(tmp_path, monkeypatch, command):
     (tmp_path / "file").touch()
     recordings.write(tmp_path, **recordings.drives())
     for place, name in (
-        (evaluate.external, "test_in"),
-        (evaluate.prediction, "predict"),
-        (evaluate.calibration, "signs"),
+        (report, "drive"),
+        (prediction, "predict"),
+        (calibration, "signs"),
     ):
         monkeypatch.setattr(place, name, begin)
     driven = {"navigation": ["--policy", "straight", "--terrain", maps(tmp_path / "large", 129)]}

@@ -77,7 +77,7 @@ def imported(folder, source, output, settings=None):
 
 def left_out(said):
     """The cell of the table that tells what was left out."""
-    return re.findall(r"\| ([^|]*) \|\n\n", said)[0]
+    return re.findall(r"\| ([^|]*?) *\|\n\n", said)[0]
 
 
 @pytest.mark.parametrize("ending", ["\n", "\n\n \n"])

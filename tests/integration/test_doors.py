@@ -16,10 +16,11 @@ from doors import door, opened, refusal
 
 from vertiwm_jax import checkpoints, machine, runs
 from vertiwm_jax import config as configuration
-from vertiwm_jax.cli import evaluate
 from vertiwm_jax.deploy import run_policy
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.evaluation import report
+from vertiwm_jax.evaluation.report import NavigationTest
 from vertiwm_jax.models import files as model_files
 from vertiwm_jax.models.config import ModelConfig
 from vertiwm_jax.models.registry import load_model
@@ -27,6 +28,7 @@ from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.planning.improvement import ImprovementConfig
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
+from vertiwm_jax.rl.learned import ResidualPolicy
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain.map import TerrainMap
@@ -243,9 +245,8 @@ def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch
 def test_how_far_sensors_see_can_be_asked_for(tmp_path):
     config = PPOTraining(navigation=NavigationConfig(sensing=SensingConfig(cells=40)))
     for asked, found in ((None, np.inf), (5.0, 5.0)):
-        command = evaluate.Navigation("random", sensing_range=asked)
-        adapted = evaluate._adapted(config, command).navigation
-        assert adapted == NavigationConfig(sensing=SensingConfig(range=found, cells=40))
+        changed = NavigationTest("random", sensing_range=asked).changed(config).navigation
+        assert changed == NavigationConfig(sensing=SensingConfig(range=found, cells=40))
     sighted = replace(config, navigation=NavigationConfig(embeddings=True))
     configuration.save(sighted, tmp_path / "config.yaml")
     navigate = ("navigation", "--policy", tmp_path, "--sensing-range", "5")
@@ -256,29 +257,28 @@ class Driven(Exception):
     """What was about to be driven."""
 
 
-@pytest.fixture
-def nothing_driven(monkeypatch):
-    """Raises `Driven` where anything would be."""
+def about_to(monkeypatch, name):
+    """Raises `Driven` where a function of the report would be called."""
 
-    def drive(*arguments):
+    def drive(*arguments, **_):
         raise Driven(*arguments)
 
-    monkeypatch.setattr(evaluate.report, "drive", drive)
+    monkeypatch.setattr(report, name, drive)
 
 
-@pytest.mark.usefixtures("nothing_driven")
-def test_a_policy_of_a_known_map_drives_on_one_that_is_revealed(run):
+def test_a_policy_of_a_known_map_drives_on_one_that_is_revealed(run, monkeypatch):
+    about_to(monkeypatch, "run_episodes")
     navigate = ["navigation", "--policy", str(run), "--suites", "easy", "--sensing-range", "12"]
     with pytest.raises(Driven) as found:
         door("evaluate")(navigate)
-    env, params, policies, *_ = found.value.args
+    env, params, policy, _ = found.value.args
     assert env.config.sensing.range == 12.0 and params.starts.observed is not None
-    assert any(name.startswith("ppo") for name in policies)
+    assert isinstance(policy, ResidualPolicy)
 
 
-@pytest.mark.usefixtures("nothing_driven")
 @pytest.mark.parametrize("planning", [True, False, None])
-def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path):
+def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path, monkeypatch):
+    about_to(monkeypatch, "drive")
     (tmp_path / "policy").symlink_to(run / "policy")
     for of_run in (ImprovementConfig(candidates=3), None):
         config = replace(configuration.load(PPOTraining, run / "config.yaml"), planning=of_run)
@@ -293,7 +293,7 @@ def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path):
             assert policies["ppo with planning"].config == (of_run or ImprovementConfig())
     if planning is not None:
         with pytest.raises(ValueError, match="planning: is of the policy of a run, found mppi"):
-            evaluate.Navigation("mppi", planning=planning)
+            NavigationTest("mppi", planning=planning)
 
 
 def test_a_policy_drives_another_vehicle(run, tmp_path, capsys):

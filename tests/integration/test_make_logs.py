@@ -35,7 +35,7 @@ def test_logs_of_a_rover_are_imported_as_they_were_recorded(recorded, tmp_path, 
     door("import_drives")(words.split())
     # What is said is in the rover's own seconds and metres.
     said = capsys.readouterr().out
-    assert "| 50.0 |" in said
+    assert "| 50.0 |" in squeezed(said)
     above = float(said.split("the body origin is ")[1].split()[0])
     found, terrain = dataset.load_drives(tmp_path / words.split("/")[-1], "train")
     before, ground = dataset.load_drives(recorded, "train")

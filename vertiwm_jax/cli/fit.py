@@ -32,5 +32,5 @@ def _draw(folder: Path) -> None:
     """Losses and errors on validation drives of the stages that learn from rollouts."""
     stages = [found.name for name in ROLLOUTS for found in sorted(folder.glob(name))]
     curves = {name: runs.read_columns(folder / name) for name in stages}
-    figure = plots.learning_curves(curves, "updates", CURVES, "updates")
+    figure = plots.learning_curves(curves, "updates", CURVES)
     figures.save(figure, folder / "learning_curves.png")

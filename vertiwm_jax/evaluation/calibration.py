@@ -1,25 +1,29 @@
-"""Whether what a model is made of, by disagreeing, tells how far off a prediction is, in metres.
+"""Bounds on the error of a prediction, from how much the parts of the model disagree.
 
-Where models that fail for different reasons disagree, one of them is wrong at least
-(Lakshminarayanan et al., 2017, of ensembles): the two specialists, or several gates about where
-between these the vehicle goes. How far off it is then, recorded drives have to tell: the scale and
-the quantiles are measured on some drives, and checked on others, as in split conformal prediction
-with normalised scores (Lei et al., 2018).
+Where models that fail for different reasons disagree, at least one of them is wrong
+(Lakshminarayanan et al., 2017, of ensembles): the two specialists, or several gates. How far off a
+prediction then is has to be measured on recorded drives. The scale and the quantiles of errors come
+from some drives and are tested on others, as in split conformal prediction with normalized scores
+(Lei et al., 2018).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from vertiwm_jax.config import Count, CountOrZero, settings
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.evaluation.prediction import TestWindows, predict
-from vertiwm_jax.evaluation.tables import markdown
+from vertiwm_jax.evaluation.tables import Row, markdown, write
 from vertiwm_jax.figures import line, sheet, style
+from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.models.registry import load_model
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,12 +35,48 @@ PARTS = 5
 _LEAST = 1e-3  # m, of a scale
 
 
+@settings
+class CalibrationTest:
+    """How far off predictions of Verti-WM are, by how much its gates or specialists disagree.
+
+    Bounds on the error are found from the validation drives, and tried on the test drives.
+    """
+
+    data: Path
+    """Folder of `.npz` files of drives, with the maps they name."""
+    weights: Path | None = None
+    """Folder of a fitted model, instead of the one that comes with the package."""
+    context: CountOrZero = 16
+    """Recorded steps that the model sees first."""
+    horizon: Count = 16
+    """Steps that it predicts."""
+    output: Path | None = None
+    """Folder for tables and a picture."""
+
+    def run(self) -> str:
+        """Runs the test and writes what `output` asks for; returns the tables as Markdown."""
+        lengths = self.context, self.horizon, self.horizon
+        model = load_model("vertiwm", self.weights)
+        (before, known), (error, disagreement) = (
+            signs(*model, TestWindows.of(*dataset.load_drives(self.data, split), *lengths))
+            for split in ("validation", "test")
+        )
+        bounds = {name: Calibration.measure(before, signal) for name, signal in known.items()}
+        best = next(iter(bounds))
+        tables = parts(error, disagreement[best]), coverage(bounds, error, disagreement)
+        text = "\n\n".join(map(markdown, tables))
+        if self.output:
+            figure = picture(bounds[best], error, disagreement[best], bounds["nothing"])
+            write(self.output, {"calibration.md": text + "\n", "calibration.png": figure})
+        return text
+
+
 @dataclass(frozen=True)
 class Calibration:
     """A bound on an error e for each level: quantile(level) of e / scale, times the scale.
 
     intercept, slope: of the scale, m and m per m, over the disagreement in a prediction.
-    scores: errors over their scales, of the drives that it was measured on, in order.
+    scores: sorted ratios of errors to their scales, of the drives that it was measured on.
     """
 
     intercept: float
@@ -44,95 +84,86 @@ class Calibration:
     scores: np.ndarray
 
     @classmethod
-    def measure(cls, error: np.ndarray, disagreement: np.ndarray | None) -> Self:
-        """From errors `[N]`, m, and disagreements `[N]`, m; without these, one bound for all."""
+    def measure(cls, error: np.ndarray, disagreement: np.ndarray) -> Self:
+        """From errors and disagreements `[N]`, m; one bound for all if these are equal."""
         slope, intercept = 0.0, float(np.mean(error))
-        if disagreement is not None:
+        if np.ptp(disagreement) > 0:
             slope, intercept = (float(x) for x in np.polyfit(disagreement, error, 1))
-        scaled = cls(intercept, slope, np.empty(0))
-        scale = scaled.scale(np.zeros_like(error) if disagreement is None else disagreement)
+        scale = cls(intercept, slope, np.empty(0)).scale(disagreement)
         return cls(intercept, slope, np.sort(error / scale))
 
     def scale(self, disagreement: np.ndarray) -> np.ndarray:
-        """Of errors, m; `[N]` of disagreements `[N]`, m."""
+        """`[N]` m, the scale of errors at disagreements `[N]`, m."""
         return np.maximum(self.intercept + self.slope * disagreement, _LEAST)
 
     def bound(self, disagreement: np.ndarray, level: float) -> np.ndarray:
-        """What a share `level` of errors is below, m; `[N]` of disagreements `[N]`, m."""
+        """`[N]` m, what a share `level` of errors is below at disagreements `[N]`, m."""
         return np.quantile(self.scores, level) * self.scale(disagreement)
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """How often bounds of one level held.
-
-    level: what they were to hold for; held: share of all windows; parts: `[PARTS]` the same, from
-    the windows with least disagreement to those with most; mean_bound: m.
-    """
-
-    level: float
-    held: float
-    parts: tuple[float, ...]
-    mean_bound: float
 
 
 def signs(
     model: Dynamics, params: Params, test: TestWindows
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Position error after the last step, and how much was disagreed before it: `[N]` each, m.
+    """Predicts windows, and sums what the model says of its certainty over the predicted steps.
 
-    Disagreement is that of the "gates", if there are several, and of the "specialists", the most
-    telling first, summed over the predicted steps; the history of the model has to hold both, as
-    Verti-WM's does. `DataError` if a prediction is not finite.
+    Args:
+        model, params: the model. Its history has to hold `disagreement` and `spread`, as that of
+            Verti-WM does.
+        test: N windows.
+
+    Returns:
+        `[N]` m, position errors after the last step, and `[N]` m by name, the most telling first:
+        how much the "gates" disagree, if there are several, and the "specialists"; and zeros as
+        "nothing".
+
+    Raises:
+        DataError: a prediction is not finite.
     """
     states, read = predict(model, params, test)
-    apart, spread = read.disagreement.sum(axis=1), read.spread.sum(axis=1)
     last = np.asarray(test.windows.state[:, -1, :3])
     error = np.linalg.norm(states.position[:, -1] - last, axis=-1)
     if lost := int(np.sum(~np.isfinite(error))):
         raise DataError(f"expected finite predictions, found {lost} of {len(error)} that are not")
-    several = {"gates": spread} if np.any(spread) else {}
-    return error, several | {"specialists": apart}
+    gates = {"gates": read.spread.sum(axis=1)} if np.any(read.spread) else {}
+    specialists = read.disagreement.sum(axis=1)
+    return error, {**gates, "specialists": specialists, "nothing": np.zeros_like(error)}
+
+
+def parts(error: np.ndarray, disagreement: np.ndarray) -> list[Row]:
+    """A row of errors `[N]`, m, for each equal part of the windows, by disagreement `[N]`, m."""
+    return [
+        {
+            "part of the windows": f"{i} of {PARTS}",
+            "disagreement, mm": f"{1000 * disagreement[part].mean():.3f}",
+            "mean error, m": f"{error[part].mean():.3f}",
+            "95 % of errors below, m": f"{np.quantile(error[part], 0.95):.3f}",
+        }
+        for i, part in enumerate(_parts(disagreement), 1)
+    ]
 
 
 def coverage(
-    calibration: Calibration, error: np.ndarray, disagreement: np.ndarray, order: np.ndarray
-) -> list[Coverage]:
-    """How often its bounds held for errors `[N]`, m, of predictions with disagreements `[N]`, m.
+    bounds: Mapping[str, Calibration], error: np.ndarray, disagreement: Mapping[str, np.ndarray]
+) -> list[Row]:
+    """A row for each level and calibration: how often its bounds hold for errors `[N]`, m.
 
-    order: `[N]` what the parts are ordered by.
+    disagreement: `[N]` m, for each calibration. The parts of the windows are by the first of them.
     """
-    parts, rows = _parts(order), []
+    by_part, rows = _parts(next(iter(disagreement.values()))), []
     for level in LEVELS:
-        bound = calibration.bound(disagreement, level)
-        held = error <= bound
-        by_part = tuple(float(held[part].mean()) for part in parts)
-        rows.append(Coverage(level, float(held.mean()), by_part, float(bound.mean())))
+        for name, calibration in bounds.items():
+            bound = calibration.bound(disagreement[name], level)
+            held = error <= bound
+            rows.append(
+                {
+                    "bound for": f"{level:.0%}",
+                    "found from": name,
+                    "mean bound, m": f"{bound.mean():.3f}",
+                    "held for": f"{held.mean():.1%}",
+                    "by part": " / ".join(f"{held[part].mean():.0%}" for part in by_part),
+                }
+            )
     return rows
-
-
-def format_parts(error: np.ndarray, disagreement: np.ndarray) -> str:
-    """A Markdown table of errors `[N]` by disagreements `[N]`, m."""
-    parts = _parts(disagreement)
-    rows = {
-        "disagreement, mm": [1000 * disagreement[part].mean() for part in parts],
-        "mean error, m": [error[part].mean() for part in parts],
-        "95 % of errors below, m": [np.quantile(error[part], 0.95) for part in parts],
-    }
-    heads = ["windows", "least disagreement", *[""] * (PARTS - 2), "most"]
-    return markdown(heads, ([name, *(f"{x:.3f}" for x in row)] for name, row in rows.items()))
-
-
-def format_coverage(rows: Mapping[str, Sequence[Coverage]]) -> str:
-    """A Markdown table of how often bounds held, by how they were found."""
-    heads = ["bound for", "found from", "mean bound, m", "held for", "by disagreement, least first"]
-    lines = []
-    for at_level in zip(*rows.values(), strict=True):
-        for name, row in zip(rows, at_level, strict=True):
-            parts = " / ".join(f"{part:.0%}" for part in row.parts)
-            held = f"{row.held:.1%}"
-            lines.append((f"{row.level:.0%}", name, f"{row.mean_bound:.3f}", held, parts))
-    return markdown(heads, lines)
 
 
 def picture(
@@ -140,28 +171,27 @@ def picture(
 ) -> Figure:
     """Errors over disagreement with their bounds, and how often bounds of any level hold.
 
-    The second panel is of the fifths with least and with most disagreement, for bounds that know
-    of it and for those that do not: on the diagonal, a bound holds as often as it says.
+    The second panel is of the windows with least and with most disagreement, for bounds that know
+    the disagreement and for those that do not. On the diagonal, a bound holds as often as it says.
     """
-    parts, ordered = _parts(disagreement), np.sort(disagreement)
+    by_part, ordered = _parts(disagreement), np.sort(disagreement)
     levels = np.linspace(0.02, 0.98, 49)
     with style():
         figure = sheet(7.2, 3.5)
         left, right = figure.subplots(1, 2)
         left.plot(disagreement, error, ".", color="0.6", markersize=2.5)
         for i, level in enumerate(LEVELS):
-            colour, dash = line(i)
+            color, dash = line(i)
             bounds = calibration.bound(ordered, level)
-            left.plot(ordered, bounds, dash, color=colour, label=f"bound for {level:.0%}")
+            left.plot(ordered, bounds, dash, color=color, label=f"bound for {level:.0%}")
         left.set(xlabel="disagreement [m]", ylabel="position error [m]")
         left.set(xscale="log", yscale="log", ylim=(np.quantile(error, 0.005), None))
         for i, (name, bounds) in enumerate({"": calibration, "not ": constant}.items()):
-            colour, _ = line(i)
-            for end, rows, dash in (("least", parts[0], "-"), ("most", parts[-1], "--")):
-                limits = [bounds.bound(disagreement[rows], level) for level in levels]
-                held = [np.mean(error[rows] <= limit) for limit in limits]
+            for end, part, dash in (("least", by_part[0], "-"), ("most", by_part[-1], "--")):
+                limits = [bounds.bound(disagreement[part], level) for level in levels]
+                held = [np.mean(error[part] <= limit) for limit in limits]
                 label = f"{name}from disagreement, where it is {end}"
-                right.plot(levels, held, dash, color=colour, label=label)
+                right.plot(levels, held, dash, color=line(i)[0], label=label)
         right.plot([0, 1], [0, 1], color="0.6", linewidth=0.8)
         right.set(xlabel="level of the bound", ylabel="share of errors below it")
         for axes in (left, right):

@@ -1,7 +1,8 @@
-"""Policies that are trained in several models and judged all alike."""
+"""Policies that are trained in several models and tested all alike, in one table."""
 
 import logging
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,26 +11,21 @@ import tyro
 
 from vertiwm_jax import atomic
 from vertiwm_jax import config as configuration
+from vertiwm_jax import runs as run_folders
 from vertiwm_jax.config import AtLeastOne, ConfigError, Count
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Agent, Policy
-from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.episodes import NavigationResult
 from vertiwm_jax.env.suites import SUITES, GroundConfig, Suite
-from vertiwm_jax.evaluation import external, policy_table, report
+from vertiwm_jax.evaluation import external, navigation, report, tables
 from vertiwm_jax.evaluation.external import Arena
-from vertiwm_jax.evaluation.policy_table import TrainingCost
 from vertiwm_jax.evaluation.report import Results
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import TRAININGS, TrainConfig
 from vertiwm_jax.runs import Run
-from vertiwm_jax.simulators import processes
-from vertiwm_jax.simulators.processes import Map
-from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.training import keep_compiled
 
-Policies = Mapping[str, Policy | Agent]
 _log = logging.getLogger(__name__)
 
 
@@ -48,14 +44,14 @@ class Row:
 
 @configuration.settings
 class CompareConfig:
-    """Train policies by several algorithms in several models, and judge them all alike."""
+    """Train policies by several algorithms in several models, and test them all alike."""
 
     rows: tyro.conf.Suppress[tyro.conf.Fixed[Annotated[tuple[Row, ...], AtLeastOne]]]
     """Which policies; in a file only."""
     simulators: Annotated[tuple[Arena, ...], AtLeastOne] = ("builtin",)
-    """What they are judged in; Chrono needs PyChrono."""
+    """What they are tested in; Chrono needs PyChrono."""
     suites: tuple[Suite, ...] = tuple(SUITES)
-    """Kinds of worlds that they are judged on."""
+    """Kinds of worlds that they are tested on."""
     suite_worlds: Count = 10
     """How many worlds of each."""
     pairs: Count = 10
@@ -79,29 +75,52 @@ class CompareConfig:
         if len(set(self.rows)) < len(self.rows):
             raise ValueError("rows: expected each of them once, found one again")
 
-    @property
-    def grounds(self) -> GroundConfig:
-        """What is driven on."""
-        return GroundConfig(suites=self.suites, suite_worlds=self.suite_worlds, pairs=self.pairs)
-
 
 def compare(config: CompareConfig) -> str:
-    """Trains what is not trained yet, and drives all policies; their table, which the run keeps."""
+    """Trains policies that are not trained yet, and tests all.
+
+    Returns their table as Markdown, which the run folder keeps beside tables and pictures of each
+    simulator.
+    """
     keep_compiled(config.compile_cache)
     settings = {row: training(config, row) for row in config.rows}
     vehicles = {chosen.vehicle for chosen in settings.values()}
     if len(vehicles) > 1:
         names = " and ".join(sorted(vehicles))
         raise ConfigError(f"{config.settings}: vehicle: expected one for all, found {names}")
+    first = settings[config.rows[0]]
     for simulator in config.simulators:
-        external.expect(simulator, settings[config.rows[0]])
+        external.expect(simulator, first)
+    ground = GroundConfig(
+        suites=config.suites, suite_worlds=config.suite_worlds, pairs=config.pairs
+    )
     with Run.begin(config, config.name) as run:
         folders = {row: _train(row, settings[row], run.folder) for row in config.rows}
-        return _judge_all(config, settings, folders, run.folder)
+        drivers: list[tuple[TrainConfig, Mapping[str, Policy | Agent]]] = [
+            (replace(settings[row], ground=ground), _learned(row, settings[row], folder))
+            for row, folder in folders.items()
+        ]
+        drivers.append((replace(first, ground=ground), first.baselines))
+        key = experiment.TaskConfig(seed=config.seed).key("worlds")
+        terrain = suites.suite_worlds(ground, key, first.driven.scale)
+        tested = {}
+        for simulator in config.simulators:
+            groups: dict[str, dict[str, NavigationResult]] = {}
+            for task, policies in drivers:
+                driven = report.drive(
+                    task, terrain, policies, ground.world_suites, simulator, config.jobs
+                )
+                for suite, results in driven.items():
+                    groups.setdefault(suite, {}).update(results)
+            report.write(run.folder / simulator, groups, terrain, first.navigation.goal_radius)
+            tested[simulator] = groups
+        table = markdown({str(row): cost(folder) for row, folder in folders.items()}, tested)
+        atomic.write(run.folder / "table.md", table + "\n")
+    return table
 
 
 def training(config: CompareConfig, row: Row) -> TrainConfig:
-    """How a policy is trained."""
+    """The settings that a policy is trained with."""
     folder, kind = config.settings, TRAININGS[row.algorithm]
     file = folder / f"{kind.name}.yaml" if folder else configuration.default_config(kind.name)
     return replace(configuration.load(kind, file), model=row.model, planning=None)
@@ -123,47 +142,47 @@ def _train(row: Row, settings: TrainConfig, folder: Path) -> Path:
     return trained.folder
 
 
-def _judge_all(
-    config: CompareConfig, settings: dict[Row, TrainConfig], folders: dict[Row, Path], output: Path
-) -> str:
-    key = experiment.TaskConfig(seed=config.seed).key("worlds")
-    first = settings[config.rows[0]]
-    terrain = suites.suite_worlds(config.grounds, key, first.driven.scale)
-    rows = [(settings[row], _learned(row, settings[row], folders[row])) for row in config.rows]
-    rows.append((first, first.baselines))
-    judged = {}
-    for simulator in config.simulators:
-        with processes.simulating(config.jobs) as mapped:
-            judged[simulator] = _judge(config.grounds, rows, terrain, simulator, mapped)
-        radius = first.navigation.goal_radius
-        report.write(output / simulator, judged[simulator], REFERENCE, terrain, radius)
-    costs = {str(row): TrainingCost.of(folder) for row, folder in folders.items()}
-    table = policy_table.markdown(costs, judged)
-    atomic.write(output / "table.md", table + "\n")
-    return table
-
-
-def _learned(row: Row, settings: TrainConfig, folder: Path) -> Policies:
+def _learned(row: Row, settings: TrainConfig, folder: Path) -> dict[str, Policy | Agent]:
     """The policies of a training, by their names in the table."""
     found = experiment.learned(settings, folder)
-    return {name.replace(row.algorithm, str(row), 1): x for name, x in found.items()}
+    return {name.replace(row.algorithm, str(row), 1): policy for name, policy in found.items()}
 
 
-def _judge(
-    grounds: GroundConfig,
-    rows: Sequence[tuple[TrainConfig, Policies]],
-    terrain: TerrainMap,
-    simulator: Arena,
-    mapped: Map,
-) -> dict[str, Results]:
-    """Episodes of every policy, by suite."""
-    groups: dict[str, dict[str, NavigationResult]] = {}
-    for settings, policies in rows:
-        settings = replace(settings, ground=grounds)
-        test = external.test_in(simulator, settings, terrain)
-        judge = external.judge_in(simulator, settings, terrain, mapped)
-        key = settings.key("testing")
-        driven = report.drive(test.env, test.params, policies, key, grounds.world_suites, judge)
-        for suite, results in driven.items():
-            groups.setdefault(suite, {}).update(results)
-    return dict(groups)
+def cost(folder: Path) -> tuple[float, int]:
+    """Seconds, and steps of 0.1 s, of the training in a folder; compilation and tests do not count.
+
+    All sessions of the training count.
+    """
+    columns = run_folders.read_columns(folder)
+    steps, rates = columns["timesteps"], columns["timesteps_per_second"]
+    each = steps[-1] / len(steps)
+    return sum(each / rate for rate in rates), int(steps[-1])
+
+
+def markdown(
+    costs: Mapping[str, tuple[float, int]], tested: Mapping[str, Mapping[str, Results]]
+) -> str:
+    """A table for each simulator: costs of trained policies, and how all policies drive by suite.
+
+    That is: successes, their mean time, and mean absolute roll and pitch.
+    """
+    sections = []
+    for simulator, groups in tested.items():
+        rows = []
+        for policy in next(iter(groups.values())):
+            spent = next((x for name, x in costs.items() if policy.startswith(name)), None)
+            minutes, rate = "", ""
+            if spent:
+                seconds, steps = spent
+                minutes, rate = f"{seconds / 60:.1f}", f"{steps / seconds:,.0f}"
+            row = {"policy": policy, "training [min]": minutes, "steps/s": rate}
+            rows.append(row | {suite: _cell(results[policy]) for suite, results in groups.items()})
+        sections.append(f"**{simulator}**\n\n{tables.markdown(rows)}")
+    return "\n\n".join(sections)
+
+
+def _cell(result: NavigationResult) -> str:
+    row = navigation.summary(result)
+    time = f", {row['seconds']:.1f} s" if row["successes"] else ""
+    tilt = f"{math.degrees(row['abs_roll']):.1f} / {math.degrees(row['abs_pitch']):.1f} deg"
+    return f"{row['successes']}/{row['tasks']}{time}, {tilt}"

@@ -1,4 +1,4 @@
-"""How well a policy drives in a simulator outside jit: the same task, a vehicle a process."""
+"""Episodes of a policy in a simulator outside jit: the same task, with one vehicle a process."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,20 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax.config import ConfigError
-from vertiwm_jax.env import episodes, suites
+from vertiwm_jax.env import episodes
 from vertiwm_jax.env.agent import Agent, Policy, as_agent
-from vertiwm_jax.env.episodes import NavigationResult, run_episodes
+from vertiwm_jax.env.episodes import NavigationResult
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import TaskParams
-from vertiwm_jax.evaluation.report import Judge
 from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.models.registry import ModelName
-from vertiwm_jax.rl import experiment
-from vertiwm_jax.rl.experiment import Task, TaskConfig
+from vertiwm_jax.rl.experiment import TaskConfig
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.simulators import chrono
-from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.simulators.driving import drive
 from vertiwm_jax.simulators.following import AgentPilot, Followed
 from vertiwm_jax.simulators.processes import Map
@@ -31,27 +28,15 @@ from vertiwm_jax.simulators.protocol import Simulator
 from vertiwm_jax.terrain.map import TerrainMap
 
 Arena = ModelName | Literal["chrono"]
-"""What moves a vehicle whose policy is judged."""
+"""What moves the vehicle in a test of policies."""
 
 
 def expect(arena: Arena, config: TaskConfig) -> None:
-    """`SimulatorError` or `ConfigError` where policies of these settings cannot be judged there."""
+    """`SimulatorError` or `ConfigError` where policies of these settings cannot be tested there."""
     if arena == "chrono":
         chrono.modules()
         if config.vehicle != HMMWV:
             raise ConfigError(f"vehicle: expected {HMMWV} in Chrono, found {config.vehicle}")
-
-
-def test_in(arena: Arena, config: TaskConfig, terrain: TerrainMap) -> Task:
-    """The test on these worlds."""
-    return experiment.test_environment(config, terrain, "builtin" if arena == "chrono" else arena)
-
-
-def judge_in(arena: Arena, config: TaskConfig, terrain: TerrainMap, mapped: Map) -> Judge:
-    """What drives the tasks of `test_in`; mapped: as in `evaluate`, for Chrono."""
-    if arena != "chrono":
-        return run_episodes
-    return partial(evaluate, Chrono, mapped, suites.test_tasks(config.ground, terrain))
 
 
 def evaluate(
@@ -63,9 +48,16 @@ def evaluate(
     agent: Policy | Agent,
     key: jax.Array,
 ) -> NavigationResult:
-    """As `run_episodes`, with the vehicle in `simulator` on the world of each task.
+    """Drives every task of the pool once, as `run_episodes`, in a simulator outside jit.
 
-    mapped: of `processes.simulating`; tasks: of which `params` has the starts.
+    Args:
+        simulator: makes one for a world.
+        mapped: of `processes.simulating`.
+        tasks: those of which `params` has the starts.
+        env, params, agent, key: as of `run_episodes`.
+
+    Returns:
+        P episodes.
     """
     env, agent = replace(env, dynamics=Followed()), as_agent(agent)
     own = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(params.pool_size))

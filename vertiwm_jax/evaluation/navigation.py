@@ -1,9 +1,8 @@
 """How well policies drive: success, time, roll and pitch over a set of tasks, as a table."""
 
-import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Self
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,6 +12,7 @@ from vertiwm_jax.env.episodes import NavigationResult, run_episodes
 from vertiwm_jax.env.navigation import make_env
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
+from vertiwm_jax.evaluation.tables import markdown
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle
 from vertiwm_jax.models.registry import Imagined
 from vertiwm_jax.rl.policy import Policy as Trained
@@ -39,7 +39,7 @@ def evaluate(
         seed: draws the default worlds, and decides what is random of the agent.
 
     Returns:
-        W * `pairs` episodes: how they ended, their duration, tilt and path. `Summary.of` of this
+        W * `pairs` episodes: how they ended, their duration, tilt and path. `summary` of this
         module sums them up.
 
     Raises:
@@ -56,45 +56,31 @@ def evaluate(
     return run_episodes(env, task, agent, jax.random.key(seed))
 
 
-@dataclasses.dataclass(frozen=True)
-class Summary:
-    """One row of a table of policies.
+def summary(result: NavigationResult) -> dict[str, Any]:
+    """Sums up episodes as plain numbers, for tables and for JSON.
 
-    tasks, successes: counts; success_interval: 95 % Wilson interval of the rate.
-    seconds, seconds_deviation: mean and standard deviation over successes; NaN without any.
-    abs_roll, abs_pitch: rad, mean over all steps of all episodes.
-    driven: m, mean over all episodes.
-    endings: how often each ending came, by name.
+    Returns:
+        tasks, successes: counts.
+        success_interval: 95 % Wilson interval of the success rate.
+        seconds, seconds_deviation: mean and standard deviation over successes; None without any.
+        abs_roll, abs_pitch: rad, mean over all steps of all episodes.
+        driven: m, mean over all episodes.
+        endings: how often each termination reason came, by name.
     """
-
-    tasks: int
-    successes: int
-    success_interval: tuple[float, float]
-    seconds: float
-    seconds_deviation: float
-    abs_roll: float
-    abs_pitch: float
-    driven: float
-    endings: Mapping[str, int]
-
-    @classmethod
-    def of(cls, result: NavigationResult) -> Self:
-        """The summary of some episodes."""
-        success = np.asarray(result.success)
-        steps = np.asarray(result.steps)
-        seconds = np.asarray(result.seconds)[success]
-        counts = np.bincount(np.asarray(result.ending), minlength=len(TerminationReason))
-        return cls(
-            tasks=len(success),
-            successes=int(success.sum()),
-            success_interval=wilson_interval(int(success.sum()), len(success)),
-            seconds=float(seconds.mean()) if len(seconds) else math.nan,
-            seconds_deviation=float(seconds.std()) if len(seconds) else math.nan,
-            abs_roll=float(np.average(result.abs_roll, weights=steps)),
-            abs_pitch=float(np.average(result.abs_pitch, weights=steps)),
-            driven=float(np.mean(result.driven)),
-            endings={e.name.lower(): int(counts[e]) for e in TerminationReason if counts[e]},
-        )
+    success, steps = np.asarray(result.success), np.asarray(result.steps)
+    successes, seconds = int(success.sum()), np.asarray(result.seconds)[success]
+    counts = np.bincount(np.asarray(result.ending), minlength=len(TerminationReason))
+    return {
+        "tasks": len(success),
+        "successes": successes,
+        "success_interval": wilson_interval(successes, len(success)),
+        "seconds": float(seconds.mean()) if successes else None,
+        "seconds_deviation": float(seconds.std()) if successes else None,
+        "abs_roll": float(np.average(result.abs_roll, weights=steps)),
+        "abs_pitch": float(np.average(result.abs_pitch, weights=steps)),
+        "driven": float(np.mean(result.driven)),
+        "endings": {e.name.lower(): int(counts[e]) for e in TerminationReason if counts[e]},
+    }
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
@@ -109,30 +95,22 @@ def wilson_interval(successes: int, trials: int, z: float = 1.96) -> tuple[float
     return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
 
 
-def format_table(rows: Mapping[str, Summary]) -> str:
-    """A Markdown table with the paper's columns, one row for each named policy."""
-    header = ["policy", "success", "95 %", "time [s]", "roll [deg]", "pitch [deg]", "driven [m]"]
-    cells: list[tuple[str, ...]] = [(*header, "endings")]
-    for name, row in rows.items():
-        low, high = (round(100 * bound) for bound in row.success_interval)
-        time = f"{row.seconds:.1f} ± {row.seconds_deviation:.1f}" if row.successes else "-"
-        endings = ", ".join(f"{ending} {count}" for ending, count in row.endings.items())
-        cells.append(
-            (
-                name,
-                f"{row.successes}/{row.tasks}",
-                f"{low}-{high}",
-                time,
-                f"{math.degrees(row.abs_roll):.2f}",
-                f"{math.degrees(row.abs_pitch):.2f}",
-                f"{row.driven:.1f}",
-                endings,
-            )
+def format_table(summaries: Mapping[str, Mapping[str, Any]]) -> str:
+    """A Markdown table of summaries by policy, with the paper's columns."""
+    rows = []
+    for policy, x in summaries.items():
+        low, high = (round(100 * bound) for bound in x["success_interval"])
+        time = f"{x['seconds']:.1f} ± {x['seconds_deviation']:.1f}" if x["successes"] else "-"
+        rows.append(
+            {
+                "policy": policy,
+                "success": f"{x['successes']}/{x['tasks']}",
+                "95 %": f"{low}-{high}",
+                "time [s]": time,
+                "roll [deg]": f"{math.degrees(x['abs_roll']):.2f}",
+                "pitch [deg]": f"{math.degrees(x['abs_pitch']):.2f}",
+                "driven [m]": f"{x['driven']:.1f}",
+                "endings": ", ".join(f"{name} {n}" for name, n in x["endings"].items()),
+            }
         )
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    cells.insert(1, tuple("-" * width for width in widths))
-    lines = (
-        " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        for row in cells
-    )
-    return "\n".join(f"| {line} |" for line in lines)
+    return markdown(rows)

@@ -1,4 +1,4 @@
-"""Plots of drives and of learning curves, readable in print and by color-blind readers."""
+"""Plots of drives and of curves, readable in print and by color-blind readers."""
 
 from __future__ import annotations
 
@@ -7,15 +7,83 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vertiwm_jax import figures
 from vertiwm_jax.terrain import picture
 from vertiwm_jax.terrain.map import TerrainMap
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+Curves = Mapping[str, "tuple[ArrayLike, ArrayLike]"]
+"""x and y of lines, by name."""
 _MARK: dict[str, Any] = {"color": "black", "markeredgecolor": "white", "linestyle": "none"}
+
+
+def panels(
+    shown: Mapping[str, Curves],
+    x_label: str,
+    y_label: str = "",
+    columns: int = 4,
+    size: tuple[float, float] = (3.2, 2.7),
+    first: int = 0,
+    sharey: bool = False,
+    line_style: Mapping[str, Any] | None = None,
+    **settings: Any,
+) -> Figure:
+    """Draws panels of lines with one legend.
+
+    Args:
+        shown: the lines of each panel, by the panel's title.
+        x_label, y_label: of all panels.
+        columns: panels side by side.
+        size: of a panel, inches.
+        first: style of the first line, see `figures.line`.
+        sharey: whether all panels have the same y axis.
+        line_style: options of `Axes.plot`.
+        settings: of every panel, for `Axes.set`.
+
+    Returns:
+        The figure, which the caller owns.
+    """
+    columns = min(columns, len(shown))
+    rows = math.ceil(len(shown) / columns)
+    with figures.style():
+        figure = figures.sheet(size[0] * columns, size[1] * rows + 0.3)
+        grid = figure.subplots(rows, columns, squeeze=False, sharey=sharey)
+        for axes, (title, lines) in zip(grid.flat, shown.items(), strict=False):
+            for i, (name, (x, y)) in enumerate(lines.items(), first):
+                color, dash = figures.line(i)
+                axes.plot(x, y, dash, color=color, label=name, **(line_style or {}))
+            axes.set(title=title, **settings)
+        for axes in grid.flat[len(shown) :]:
+            axes.set_axis_off()
+        figure.supxlabel(x_label, fontsize=9)
+        figure.supylabel(y_label, fontsize=9)
+        handles, labels = grid.flat[0].get_legend_handles_labels()
+        if len(handles) > 1:
+            figure.legend(handles, labels, loc="outside upper center", ncols=4)
+    return figure
+
+
+def learning_curves(
+    metrics: Mapping[str, Mapping[str, Sequence[float]]], x: str, labels: Mapping[str, str]
+) -> Figure:
+    """One panel for each of `labels`, metric name to title, one line for each run.
+
+    metrics: by run, columns of numbers of equal length by metric name. `x` names the column of
+        the horizontal axis. NaN leaves a gap; a run may lack metrics.
+    """
+    shown = {
+        label: {
+            run: (table[x], table.get(metric, np.full(len(table[x]), np.nan)))
+            for run, table in metrics.items()
+        }
+        for metric, label in labels.items()
+    }
+    return panels(shown, x, columns=math.ceil(math.sqrt(len(labels))))
 
 
 def trajectories(
@@ -26,10 +94,10 @@ def trajectories(
     goal_radius: float,
     step_seconds: float,
 ) -> Figure:
-    """Drives over the shaded map of one world, with roll and pitch over time beside it.
+    """Draws drives over the shaded map of one world, with roll and pitch over time beside it.
 
     drives: by name, positions `[T, 3]` m and roll, pitch, yaw `[T, 3]` rad, all to the one goal
-    `[2 or 3]`. The caller saves and owns the figure; no window is opened.
+        `[2 or 3]`, m.
     """
     with figures.style():
         figure = figures.sheet(9.0, 4.6)
@@ -38,72 +106,34 @@ def trajectories(
         roll = figure.add_subplot(grid[0, 1])
         pitch = figure.add_subplot(grid[1, 1], sharex=roll)
         picture.draw_map(overhead, terrain, world, f"world {world}")
-        overhead.add_patch(_circle(goal, goal_radius))
-        overhead.plot(
-            *goal[:2],
-            "*",
-            **_MARK,
-            markersize=9,
-            zorder=4,
-            label=f"goal, in a circle of {goal_radius:g} m",
-        )
         for i, (name, (position, rpy)) in enumerate(drives.items()):
-            colour, dash = figures.line(i)
+            color, dash = figures.line(i)
             x, y = position[:, 0], position[:, 1]
             overhead.plot(x, y, color="white", linewidth=3.2, alpha=0.8)
-            overhead.plot(x, y, dash, label=name, linewidth=1.8, color=colour)
+            overhead.plot(x, y, dash, label=name, linewidth=1.8, color=color)
             start, end = ("start", "end of a drive") if i == 0 else (None, None)
-            overhead.plot(x[-1], y[-1], "s", color=colour, markersize=5, label=end)
+            overhead.plot(x[-1], y[-1], "s", color=color, markersize=5, label=end)
             overhead.plot(x[0], y[0], "o", **_MARK, markersize=5, label=start)
             seconds = step_seconds * np.arange(len(rpy))
             for axes, angle in ((roll, rpy[:, 0]), (pitch, rpy[:, 1])):
-                axes.plot(seconds, np.degrees(angle), dash, color=colour)
+                axes.plot(seconds, np.degrees(angle), dash, color=color)
+        draw_goal(overhead, goal, goal_radius)
         roll.set_ylabel("roll [deg], left side up")
         pitch.set_ylabel("pitch [deg], nose down")
         pitch.set_xlabel("time [s]")
         roll.tick_params(labelbottom=False)
-        lines = [shown for shown in overhead.lines if not str(shown.get_label()).startswith("_")]
-        drawn = [shown for shown in lines if shown.get_label() in drives]
-        handles: list[Any] = drawn + [shown for shown in lines if shown not in drawn]
-        handles += picture.ground_legend(terrain, [world])
-        figure.legend(handles=handles, loc="outside upper center", ncols=4)
+        handles, _ = overhead.get_legend_handles_labels()
+        handles.sort(key=lambda line: line.get_label() not in drives)
+        legend = [*handles, *picture.ground_legend(terrain, [world])]
+        figure.legend(handles=legend, loc="outside upper center", ncols=4)
     return figure
 
 
-def learning_curves(
-    metrics: Mapping[str, Mapping[str, Sequence[float]]],
-    x: str,
-    labels: Mapping[str, str],
-    x_label: str,
-) -> Figure:
-    """One panel for each of `labels`, metric name to axis label, one line for each run.
-
-    metrics: by run, columns of numbers of equal length by metric name. `x` names the column of
-    the horizontal axis. NaN leaves a gap; a run may lack metrics.
-    """
-    with figures.style():
-        columns = math.ceil(math.sqrt(len(labels)))
-        rows = math.ceil(len(labels) / columns)
-        figure = figures.sheet(3.2 * columns, 2.5 * rows + 0.3)
-        panels = figure.subplots(rows, columns, squeeze=False, sharex=True)
-        for axes, (metric, label) in zip(panels.flat, labels.items(), strict=False):
-            for i, (run, table) in enumerate(metrics.items()):
-                colour, dash = figures.line(i)
-                values = table.get(metric, [math.nan] * len(table[x]))
-                axes.plot(table[x], values, dash, label=run, color=colour)
-            axes.set_ylabel(label)
-        for axes in panels.flat[len(labels) :]:
-            axes.set_axis_off()
-        for axes in panels.flat[max(0, len(labels) - columns) : len(labels)]:
-            axes.set_xlabel(x_label)
-            axes.tick_params(labelbottom=True)
-        if len(metrics) > 1:
-            handles = panels.flat[0].get_legend_handles_labels()
-            figure.legend(*handles, loc="outside upper center", ncols=4)
-    return figure
-
-
-def _circle(centre: np.ndarray, radius: float):
+def draw_goal(axes: Axes, goal: np.ndarray, radius: float) -> None:
+    """Draws a goal `[2 or 3]`, m, on a map, with the circle in which it is reached."""
     from matplotlib.patches import Circle
 
-    return Circle((centre[0], centre[1]), radius, fill=False, color="black", linewidth=1.2)
+    x, y = goal[:2]
+    axes.add_patch(Circle((x, y), radius, fill=False, color="black", linewidth=1.2))
+    label = f"goal, in a circle of {radius:g} m"
+    axes.plot(x, y, "*", **_MARK, markersize=10, zorder=4, label=label)

@@ -1,6 +1,6 @@
 """Open-loop prediction error of dynamics models on recorded drives."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Self
@@ -11,8 +11,7 @@ import numpy as np
 
 from vertiwm_jax import geometry
 from vertiwm_jax.dynamics import Dynamics, History, Params, disagreement, spread
-from vertiwm_jax.evaluation.published import POSITION_ERRORS
-from vertiwm_jax.evaluation.tables import markdown
+from vertiwm_jax.evaluation.tables import Row, markdown
 from vertiwm_jax.learning import windows as recorded
 from vertiwm_jax.learning.dataset import Drives, WheelSignals
 from vertiwm_jax.learning.objectives import open_loop
@@ -20,6 +19,7 @@ from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.mechanics.simulator import SimulatorHistory
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.soil import Soil
 from vertiwm_jax.world_model.alone import AloneHistory
 from vertiwm_jax.world_model.nesam import NesamHistory
 from vertiwm_jax.world_model.verti_wm import VertiWMHistory
@@ -39,10 +39,11 @@ BATCH = 512
 
 @dataclass(frozen=True)
 class TestWindows:
-    """Windows of drives to predict.
+    """N windows of drives to predict.
 
     drive: `[N]` index of the drive that each is from. Windows of a drive are much alike, so
-    intervals are drawn over drives.
+        intervals are drawn over drives.
+    groups: names of the groups that errors are averaged over; `windows.ground` has their indices.
     """
 
     __test__ = False  # the name starts as pytest's classes do
@@ -50,6 +51,7 @@ class TestWindows:
     windows: Windows
     drive: np.ndarray
     terrain: TerrainMap
+    groups: tuple[str, ...] = GROUNDS
 
     @classmethod
     def of(
@@ -71,14 +73,19 @@ class Interval:
     low: float
     high: float
 
+    def __str__(self) -> str:
+        return f"{self.mean:.3f} ({self.low:.3f}-{self.high:.3f})"
+
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """Errors of one model after so many steps, the horizon.
+    """Errors of one model after so many steps, the horizon, by group of windows.
 
-    final: by measure and then by kind of ground, mean absolute error after the last step.
-    growth: by kind of ground, mean position error after each step, m.
-    count: by kind of ground, windows.
+    By default, windows are grouped by the kind of ground.
+
+    final: by measure and then by group, mean absolute error after the last step.
+    growth: by group, mean position error after each step, m.
+    count: by group, windows.
     diverged: windows whose prediction is not finite; they enter as if the model had not moved.
     """
 
@@ -106,16 +113,16 @@ class Reading(NamedTuple):
     def of(cls, history: History) -> Self:
         """Read from the history after the step."""
         alpha = getattr(history, "coefficients", None)
-        return cls(alpha, disagreement(history), spread(history), modelled(history))
+        return cls(alpha, disagreement(history), spread(history), modeled_wheels(history))
 
 
-def modelled(history: History) -> WheelSignals | None:
-    """What a model keeps of its wheels, if it has any; forces are of the last sub-step."""
+def modeled_wheels(history: History) -> WheelSignals | None:
+    """Wheel states in the history of a model, if it has any; forces are of the last sub-step."""
     match history:
         case VertiWMHistory(nesam=specialist) | AloneHistory(specialist=specialist):
-            return modelled(specialist)
+            return modeled_wheels(specialist)
         case NesamHistory(simulator=memory):
-            return modelled(memory)
+            return modeled_wheels(memory)
         case SimulatorHistory(wheel_speed=speed, sinkage=sinkage, force=force):
             return WheelSignals(wheel_omega=speed, wheel_sinkage=sinkage, wheel_force=force)
     return None
@@ -128,24 +135,33 @@ class Predicted(NamedTuple):
     read: Reading
 
 
-def predict(dynamics: Dynamics, params: Params, test: TestWindows) -> Predicted:
-    """Open-loop predictions of every window, in host memory.
+def predict(
+    dynamics: Dynamics, params: Params, test: TestWindows, soils: Soil | None = None
+) -> Predicted:
+    """Predicts every window open-loop; the results are in host memory.
 
-    The history is warmed up on the recorded context; from its last state on, the model sees its
-    own predictions and the recorded commands (the paper's protocol, Sec. V-A).
+    The history is warmed up on the recorded context. From its last state on, the model sees its own
+    predictions and the recorded commands (the paper's protocol, Sec. V-A).
+
+    Args:
+        dynamics, params: the model.
+        test: N windows.
+        soils: leaves `[N, K]`, soils of the K classes in each window; by default those of the map.
     """
-    return jax.device_get(_predict(dynamics, params, test.terrain, test.windows))
+    return jax.device_get(_predict(dynamics, params, test.terrain, test.windows, soils))
 
 
 @partial(jax.jit, static_argnames="dynamics")
 def _predict(
-    dynamics: Dynamics, params: Params, terrain: TerrainMap, windows: Windows
+    dynamics: Dynamics, params: Params, terrain: TerrainMap, windows: Windows, soils: Soil | None
 ) -> Predicted:
-    def one(window: Windows) -> Predicted:
+    def one(inputs: tuple[Windows, Soil | None]) -> Predicted:
+        window, soil = inputs
         ground = terrain.select(window.world)
+        ground = ground if soil is None else ground.with_soils(soil)
         return Predicted(*open_loop(dynamics, params, ground, window, Reading.of))
 
-    return jax.lax.map(one, windows, batch_size=BATCH)
+    return jax.lax.map(one, (windows, soils), batch_size=BATCH)
 
 
 def absolute_errors(
@@ -171,27 +187,28 @@ def absolute_errors(
 
 
 def evaluate(name: str, dynamics: Dynamics, params: Params, test: TestWindows) -> PredictionErrors:
-    """Errors of a model after the last step of every window, by kind of ground."""
+    """Errors of a model after the last step of every window, by group."""
     return summary(name, predict(dynamics, params, test).states, test)
 
 
 def summary(
     name: str, predicted: VehicleState, test: TestWindows, horizon: int | None = None
 ) -> PredictionErrors:
-    """Errors of predictions after `horizon` steps, by default all of them, by kind of ground."""
+    """Errors of predictions after `horizon` steps, by default all of them, by group."""
     errors, lost = absolute_errors(predicted, test)
     horizon = int(horizon or errors["position"].shape[1])
-    ground = np.asarray(test.windows.ground)
-    rows = {kind: ground == i for i, kind in enumerate(GROUNDS) if (ground == i).any()}
+    group = np.asarray(test.windows.ground)
+    members = {test.groups[i]: group == i for i in np.unique(group).tolist()}
     final = {
         measure: {
-            kind: bootstrap(error[row, horizon - 1], test.drive[row]) for kind, row in rows.items()
+            kind: bootstrap(error[rows, horizon - 1], test.drive[rows])
+            for kind, rows in members.items()
         }
         for measure, error in errors.items()
     }
     position = errors["position"][:, :horizon]
-    growth = {kind: position[row].mean(axis=0).tolist() for kind, row in rows.items()}
-    count = {kind: int(row.sum()) for kind, row in rows.items()}
+    growth = {kind: position[rows].mean(axis=0).tolist() for kind, rows in members.items()}
+    count = {kind: int(rows.sum()) for kind, rows in members.items()}
     return PredictionErrors(name, horizon, final, growth, count, int(lost.sum()))
 
 
@@ -227,48 +244,33 @@ def prediction_errors(
     return evaluate(name, dynamics, params, test)
 
 
-def format_table(rows: Sequence[PredictionErrors], measure: str) -> str:
-    """A Markdown table of one measure, one model a row; the paper's figures where it has them."""
-    kinds = list(rows[0].count)
-    published = [_published(row, measure) for row in rows]
-    heads = ["model", *(f"{kind} (n = {rows[0].count[kind]})" for kind in kinds), "diverged"]
-    heads += [f"the paper, 16 steps: {' / '.join(kinds)}"] if any(published) else []
-    lines = []
-    for row, paper in zip(rows, published, strict=True):
-        found = [row.final[measure][kind] for kind in kinds]
-        cells = [row.name, *(f"{x.mean:.3f} ({x.low:.3f}-{x.high:.3f})" for x in found)]
-        cells.append(str(row.diverged))
-        if any(published):
-            figures = [f"{paper[kind]:.3f}" if kind in paper else "-" for kind in kinds]
-            cells.append(" / ".join(figures) if paper else "")
-        lines.append(cells)
-    title = f"{rows[0].horizon}-step {measure} error, {MEASURES[measure]}"
-    return f"{title}: mean and 95 % interval over drives\n\n{markdown(heads, lines)}"
+def format_table(models: Sequence[PredictionErrors], measure: str) -> str:
+    """A Markdown table of one measure, one model a row, one group of windows a column."""
+    rows = []
+    for model in models:
+        found = model.final[measure].items()
+        cells = {f"{group} (n = {model.count[group]})": str(error) for group, error in found}
+        rows.append({"model": model.name, **cells, "diverged": model.diverged})
+    title = f"{models[0].horizon}-step {measure} error, {MEASURES[measure]}"
+    return f"{title}: mean and 95 % interval over drives\n\n{markdown(rows)}"
 
 
-def csv_lines(rows: Sequence[PredictionErrors]) -> list[Mapping[str, str | float]]:
-    """One line for each model, measure and kind of ground."""
+def csv_rows(models: Sequence[PredictionErrors]) -> list[Row]:
+    """A row for each model, measure and group of windows."""
     return [
         {
-            "model": row.name,
-            "steps": row.horizon,
+            "model": model.name,
+            "steps": model.horizon,
             "measure": measure,
             "unit": MEASURES[measure],
-            "ground": kind,
-            "windows": row.count[kind],
-            "mean": x.mean,
-            "low": x.low,
-            "high": x.high,
-            "paper": _published(row, measure).get(kind, ""),
+            "ground": group,
+            "windows": model.count[group],
+            **vars(error),
         }
-        for row in rows
-        for measure, by_kind in row.final.items()
-        for kind, x in by_kind.items()
+        for model in models
+        for measure, by_group in model.final.items()
+        for group, error in by_group.items()
     ]
-
-
-def _published(row: PredictionErrors, measure: str) -> dict[str, float]:
-    return POSITION_ERRORS.get(row.name, {}) if measure == "position" else {}
 
 
 def bootstrap(values: np.ndarray, groups: np.ndarray, draws: int = 1000) -> Interval:

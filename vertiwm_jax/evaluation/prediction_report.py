@@ -1,17 +1,18 @@
-"""What a test of predictions leaves behind: tables, pictures, and where the error is."""
+"""The test of predictions: its settings, its tables and its pictures."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import jax
 import numpy as np
 
-from vertiwm_jax import atomic, figures
-from vertiwm_jax.evaluation import error_sources, prediction, wheels
+from vertiwm_jax import config as configuration
+from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, settings
+from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.evaluation import error_sources, plots, prediction, wheels
 from vertiwm_jax.evaluation.prediction import (
     BATCH,
     MEASURES,
@@ -19,8 +20,16 @@ from vertiwm_jax.evaluation.prediction import (
     PredictionErrors,
     TestWindows,
 )
-from vertiwm_jax.evaluation.tables import csv_text
+from vertiwm_jax.evaluation.tables import csv_text, markdown, write
+from vertiwm_jax.learning import dataset
+from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.learning.windows import GROUNDS, Windows
+from vertiwm_jax.mechanics import vehicle
+from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
+from vertiwm_jax.mechanics.vehicle import HMMWV
+from vertiwm_jax.models.config import SoilSource
+from vertiwm_jax.models.registry import ModelName, load_fitted, load_model
+from vertiwm_jax.runs import Progress
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -33,63 +42,123 @@ SHARES = (0.25, 0.5, 0.75, 0.95)
 """Windows that are pictured: those than which this share of all on such ground err less."""
 AROUND = 8
 """Steps before and after a crossing in which fusion coefficients are pictured."""
-COLUMNS = 4
-"""Panels side by side."""
 
 
-def write(
-    folder: Path,
-    rows: Sequence[Sequence[PredictionErrors]],
+@settings
+class PredictionTest:
+    """Open-loop position errors of a model on recorded drives, beside two kinematic baselines."""
+
+    data: Path
+    """Folder of `.npz` files of drives, with the maps they name."""
+    models: Annotated[tuple[ModelName, ...], AtLeastOne] = (
+        "vertiwm",
+        "nesam",
+        "transformer",
+        "builtin",
+    )
+    """The models."""
+    weights: Path | None = None
+    """Folder of a fitted model, instead of the one that comes with the package."""
+    vehicle: str = HMMWV
+    """What the built-in simulator and the bicycle drive: the name of a vehicle that comes along, or
+    a YAML file of one."""
+    soil: SoilSource | None = None
+    """Where the models have soils from, if not from where they had them when they were fitted."""
+    compare: tuple[Path, ...] = ()
+    """Run folders of `fit`, of which each part is a row."""
+    split: dataset.Split = "test"
+    """Which of the drives."""
+    context: CountOrZero = 16
+    """Recorded steps that a model sees first."""
+    horizon: Annotated[tuple[Count, ...], AtLeastOne] = (16,)
+    """Steps that it predicts; of several numbers of steps there is a table each."""
+    stride: Count = 16
+    """Steps from one window to the next."""
+    output: Path | None = None
+    """Folder for tables and pictures, also of where and how the first model errs."""
+
+    def run(self) -> str:
+        """Runs the test and writes what `output` asks for; returns position errors as Markdown."""
+        drives, terrain = dataset.load_drives(self.data, self.split)
+        test = TestWindows.of(drives, terrain, self.context, max(self.horizon), self.stride)
+        driven = vehicle.load(self.vehicle).vehicle
+        models: dict[str, tuple[Dynamics, Params]] = {
+            name: load_model(name, self.weights, vehicle=driven, soil=self.soil)
+            for name in self.models
+        }
+        models |= _fitted(self.compare)
+        models["kinematic bicycle"] = KinematicBicycle(), bicycle_of(driven)
+        models["constant velocity"] = ConstantVelocity(), None
+        predicted = {}
+        with Progress(len(models), "models") as progress:
+            for name, model in models.items():
+                predicted[name] = prediction.predict(*model, test)
+                progress.advance(1, f"{name}, {len(test):,} windows")
+        errors = [
+            [prediction.summary(name, x.states, test, steps) for name, x in predicted.items()]
+            for steps in sorted(self.horizon)
+        ]
+        if self.output:
+            drawn = {name: predicted[name] for name in self.models}
+            write(self.output, dict(_files(errors, test, drawn)))
+        return "\n\n".join(prediction.format_table(rows, "position") for rows in errors)
+
+
+def _fitted(folders: Sequence[Path]) -> dict[str, tuple[Dynamics, Params]]:
+    """Every model that was fitted in these runs; a name that two of them have gets the folder's."""
+    names = [configuration.load(FitConfig, folder / "config.yaml").name for folder in folders]
+    return {
+        f"{name if names.count(name) == 1 else folder.name}: {part}": model
+        for name, folder in zip(names, folders, strict=True)
+        for part, model in load_fitted(folder / "model").items()
+    }
+
+
+def _files(
+    errors: Sequence[Sequence[PredictionErrors]],
     test: TestWindows,
     predicted: Mapping[str, Predicted],
-) -> None:
-    """All measures as Markdown and CSV, and pictures.
+) -> Iterable[tuple[str, str | Figure]]:
+    """All measures as Markdown and CSV, and pictures, by file name.
 
-    rows: of all models, for each horizon, the longest last. predicted: what models predict whose
-        paths are drawn; the first of them is looked into.
+    errors: of all models, for each horizon, the longest last. predicted: by the models whose paths
+        are drawn; the first of them is looked into.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     name, (states, read) = next(iter(predicted.items()))
     error = prediction.absolute_errors(states, test)[0]["position"][:, -1]
-    tables = [prediction.format_table(models, measure) for models in rows for measure in MEASURES]
-    tables.append(f"Position error of {name}, where it is\n")
-    tables.append(error_sources.format_shares(error_sources.locate(test, error)))
-    if turning := wheels.compare(read.wheels, test):
-        horizon = states.position.shape[1]
-        tables.append(f"Wheels of {name} after {horizon} steps, beside those recorded\n")
-        tables.append(wheels.format_table(turning))
-    atomic.write(folder / "prediction.md", "\n\n".join(tables) + "\n")
-    lines = [line for models in rows for line in prediction.csv_lines(models)]
-    atomic.write(folder / "prediction.csv", csv_text(lines))
-
-    growth = {row.name: row.growth for row in rows[-1]}
-    figures.save(error_growth(growth, STEP_SECONDS), folder / "prediction.png")
-    figures.save(paths(_panels(test, error, predicted)), folder / "paths.png")
+    tables = [prediction.format_table(rows, measure) for rows in errors for measure in MEASURES]
+    tables.append(f"Position error of {name}, where it is")
+    tables.append(markdown(error_sources.shares(test, error)))
+    if of_wheels := wheels.compare(read.wheels, test):
+        steps = states.position.shape[1]
+        tables.append(f"Wheels of {name} after {steps} steps, beside those recorded")
+        tables.append(markdown(of_wheels))
+    yield "prediction.md", "\n\n".join(tables) + "\n"
+    yield "prediction.csv", csv_text([row for rows in errors for row in prediction.csv_rows(rows)])
+    yield "prediction.png", error_growth({row.name: row.growth for row in errors[-1]})
+    yield "paths.png", paths(_chosen(test, error, predicted))
     if read.coefficients is not None and (traces := crossings(test, read.coefficients)):
-        seconds = STEP_SECONDS * np.arange(-AROUND, AROUND + 1)
-        figure = coefficients(traces, COEFFICIENTS, seconds)
-        figures.save(figure, folder / "coefficients.png")
+        yield "coefficients.png", coefficients(traces)
 
 
-def _panels(
+def _chosen(
     test: TestWindows, error: np.ndarray, predicted: Mapping[str, Predicted]
-) -> list[tuple[str, dict[str, np.ndarray]]]:
-    """On every kind of ground, windows that are predicted well to badly."""
+) -> dict[str, dict[str, np.ndarray]]:
+    """On every kind of ground, windows that are predicted well to badly, for `paths`."""
     c, ground = test.windows.context, np.asarray(test.windows.ground)
     state = np.asarray(test.windows.state)
     lines = {"recorded": state[:, c:, :2]}
     for name, (states, _) in predicted.items():
         lines[name] = np.concatenate([state[:, c, None, :2], states.position[..., :2]], axis=1)
-    panels = []
-    for kind in sorted(set(ground)):
+    chosen = {}
+    for kind in np.unique(ground):
         found = np.flatnonzero(ground == kind)
         ordered = found[np.argsort(error[found])]
         for share in SHARES:
             row = ordered[int(share * (len(ordered) - 1))]
             title = f"{GROUNDS[kind]}: {share:.0%} below {error[row]:.2f} m"
-            seen = {name: _ahead(state[row, c], path[row]) for name, path in lines.items()}
-            panels.append((title, seen))
-    return panels
+            chosen[title] = {name: _ahead(state[row, c], path[row]) for name, path in lines.items()}
+    return chosen
 
 
 def _ahead(start: np.ndarray, path: np.ndarray) -> np.ndarray:
@@ -110,96 +179,74 @@ def _on_soil(terrain: TerrainMap, windows: Windows) -> jax.Array:
 
 
 def crossings(test: TestWindows, alphas: np.ndarray) -> dict[str, np.ndarray]:
-    """Mean coefficients `[2 AROUND + 1, C]` about the crossing of a border of soil, by direction.
+    """Averages fusion coefficients about the crossing of a border of soil, by direction.
 
-    alphas: `[N, K, C]` of all predicted steps. Only windows that cross once count; NaN
-    where none of them reaches.
+    Only windows that cross one border once count.
+
+    Args:
+        test: N windows.
+        alphas: `[N, K, C]` coefficients of all predicted steps.
+
+    Returns:
+        `[2 AROUND + 1, C]` for each direction, NaN where no window reaches.
     """
     soft = np.asarray(_on_soil(test.terrain, test.windows))
     changed = soft[:, 1:] != soft[:, :-1]
-    steps = changed.shape[1]
+    padded = np.pad(alphas, [(0, 0), (AROUND, AROUND), (0, 0)], constant_values=np.nan)
     traces = {}
     for title, onto in (("onto soil", True), ("off soil", False)):
         rows = np.flatnonzero((changed.sum(axis=1) == 1) & (soft[:, -1] == onto))
-        if not len(rows):
-            continue
-        shifted = np.full((len(rows), 2 * AROUND + 1, alphas.shape[-1]), np.nan)
-        for i, row in enumerate(rows):
-            place = np.arange(-AROUND, AROUND + 1) + changed[row].argmax()
-            inside = (place >= 0) & (place < steps)
-            shifted[i, inside] = alphas[row, place[inside]]
-        count = np.isfinite(shifted).sum(axis=0)
-        total = np.nansum(shifted, axis=0)
-        mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-        traces[f"{title} ({len(rows)} windows)"] = mean
+        if len(rows):
+            around = changed[rows].argmax(axis=1)[:, None] + np.arange(2 * AROUND + 1)
+            mean = np.ma.masked_invalid(padded[rows[:, None], around]).mean(axis=0)
+            traces[f"{title} ({len(rows)} windows)"] = mean.filled(np.nan)
     return traces
 
 
-def error_growth(
-    growth: Mapping[str, Mapping[str, Sequence[float]]], step_seconds: float
-) -> Figure:
+def error_growth(growth: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
     """Position error over the time predicted, a panel for each kind of ground.
 
     growth: by model and then by kind, m after each step.
     """
-    kinds = list(next(iter(growth.values())))
-    with figures.style():
-        figure = figures.sheet(3.2 * len(kinds), 2.8)
-        panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
-        for axes, kind in zip(panels, kinds, strict=True):
-            for i, (name, by_kind) in enumerate(growth.items()):
-                colour, dash = figures.line(i)
-                seconds = step_seconds * (1 + np.arange(len(by_kind[kind])))
-                axes.plot(seconds, by_kind[kind], dash, label=name, color=colour)
-            axes.set(title=kind, xlabel="time [s]", xlim=(0, None), yscale="log")
-        panels[0].set_ylabel("position error [m]")
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
-    return figure
+    shown = {
+        kind: {
+            name: (STEP_SECONDS * (1 + np.arange(len(of[kind]))), of[kind])
+            for name, of in growth.items()
+        }
+        for kind in next(iter(growth.values()))
+    }
+    return plots.panels(shown, "time [s]", "position error [m]", sharey=True, yscale="log")
 
 
-def paths(panels: Sequence[tuple[str, Mapping[str, np.ndarray]]]) -> Figure:
-    """Paths seen from above, a panel for each window: its title, and `[T, 2]` m by name.
+def paths(windows: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
+    """Paths seen from above, a panel for each window: `[T, 2]` m by name, by the panel's title.
 
     x is forward, drawn upwards, and y to the left. The first of each panel is the recorded one.
     """
-    with figures.style():
-        rows = math.ceil(len(panels) / COLUMNS)
-        figure = figures.sheet(2.4 * COLUMNS, 2.5 * rows + 0.3)
-        grid = figure.subplots(rows, COLUMNS, squeeze=False)
-        for axes, (title, lines) in zip(grid.flat, panels, strict=False):
-            for i, (name, path) in enumerate(lines.items()):
-                colour, dash = ("black", "-") if i == 0 else figures.line(i - 1)
-                ends = "o" if i == 0 else "s"
-                axes.plot(-path[:, 1], path[:, 0], dash, color=colour, label=name)
-                axes.plot(-path[-1, 1], path[-1, 0], ends, color=colour, markersize=3.5)
-            axes.set_title(title, fontsize=8)
-            axes.set_aspect("equal", adjustable="datalim")
-        for axes in grid.flat[len(panels) :]:
-            axes.set_axis_off()
-        figure.supxlabel("to the right [m]")
-        figure.supylabel("forward [m]")
-        handles = grid.flat[0].get_legend_handles_labels()
-        figure.legend(*handles, loc="outside upper center", ncols=len(handles[0]))
-    return figure
+    shown = {
+        title: {name: (-path[:, 1], path[:, 0]) for name, path in lines.items()}
+        for title, lines in windows.items()
+    }
+    ends = {"marker": "s", "markersize": 3.5, "markevery": [-1]}
+    labels = "to the right [m]", "forward [m]"
+    return plots.panels(
+        shown, *labels, first=-1, line_style=ends, aspect="equal", adjustable="datalim"
+    )
 
 
-def coefficients(
-    traces: Mapping[str, np.ndarray], groups: Sequence[str], seconds: np.ndarray
-) -> Figure:
+def coefficients(traces: Mapping[str, np.ndarray]) -> Figure:
     """Fusion coefficients about the moment in which a border of soil is crossed.
 
-    traces: by direction, means `[T, G]`, NaN where there are none; groups: names of the G.
-    seconds: `[T]` since the crossing.
+    traces: `[2 T + 1, C]` by direction, the crossing in the middle; NaN where there are none.
     """
-    with figures.style():
-        figure = figures.sheet(3.6 * len(traces), 2.9)
-        panels = figure.subplots(1, len(traces), sharey=True, squeeze=False)[0]
-        for axes, (title, trace) in zip(panels, traces.items(), strict=True):
-            for i, name in enumerate(groups):
-                colour, dash = figures.line(i)
-                axes.plot(seconds, trace[:, i], dash, color=colour, label=name)
-            axes.axvline(0.0, color="0.6", linewidth=0.8)
-            axes.set(title=title, xlabel="time since the crossing [s]")
-        panels[0].set_ylabel("0 Transformer, 1 NeSAM")
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    shown = {}
+    for title, trace in traces.items():
+        seconds = STEP_SECONDS * (np.arange(len(trace)) - len(trace) // 2)
+        shown[title] = {
+            name: (seconds, values) for name, values in zip(COEFFICIENTS, trace.T, strict=True)
+        }
+    labels = "time since the crossing [s]", "0 Transformer, 1 NeSAM"
+    figure = plots.panels(shown, *labels, sharey=True)
+    for axes in figure.axes:
+        axes.axvline(0.0, color="0.6", linewidth=0.8)
     return figure

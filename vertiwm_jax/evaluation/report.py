@@ -1,34 +1,43 @@
-"""What a test of policies leaves behind: tables by suite, every episode, and pictures."""
+"""The test of policies: its settings, its tables by suite, all episodes, and pictures."""
 
-import dataclasses
 import json
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 
-from vertiwm_jax import atomic, figures, machine, runs
+from vertiwm_jax import config as configuration
+from vertiwm_jax import figures, machine, runs
+from vertiwm_jax.config import Count, settings
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.episodes import NavigationResult, run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.task import TaskParams
+from vertiwm_jax.env.suites import Suite, test_tasks
 from vertiwm_jax.env.termination import TerminationReason
-from vertiwm_jax.evaluation import plots
-from vertiwm_jax.evaluation.navigation import Summary, format_table
-from vertiwm_jax.evaluation.tables import csv_text
+from vertiwm_jax.evaluation import external, navigation, plots
+from vertiwm_jax.evaluation.external import Arena
+from vertiwm_jax.evaluation.tables import Row, csv_text
+from vertiwm_jax.evaluation.tables import write as write_files
+from vertiwm_jax.planning.improvement import ImprovementConfig
+from vertiwm_jax.planning.mppi import MPPI, MPPIConfig
+from vertiwm_jax.planning.shooting import Shooting, ShootingConfig
 from vertiwm_jax.rl import experiment
-from vertiwm_jax.rl.experiment import Trained
+from vertiwm_jax.rl.experiment import TaskConfig, TrainConfig, Trained
+from vertiwm_jax.simulators import processes
+from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain.map import TerrainMap
 
 Results = Mapping[str, NavigationResult]
-Judge = Callable[[NavigationEnv, TaskParams, Policy | Agent, jax.Array], NavigationResult]
+"""Episodes, by policy."""
 
 CURVES = {
     "episode_return": "return",
@@ -44,45 +53,166 @@ GIVEN_MAPS = "given maps"
 _log = logging.getLogger(__name__)
 
 
+@settings
+class NavigationTest:
+    """Success, time, roll and pitch of a policy, on worlds that it was not trained on.
+
+    The worlds and tasks are those held out of the policy's training, unless others are asked for.
+    """
+
+    policy: Literal["straight", "random", "mppi", "shooting"] | Path
+    """Folder of a training run, or what has learned nothing: a controller, or a plan in a model."""
+    mppi: MPPIConfig = MPPIConfig()
+    """How it plans, and in which model, whatever moves the vehicle."""
+    shooting: ShootingConfig = ShootingConfig()
+    """The same of planning by gradients."""
+    planning: bool | None = None
+    """Whether the policy of a run drives a second time, planning; by default as its run says."""
+    simulator: Arena = "builtin"
+    """What moves the vehicle; Chrono needs PyChrono, and moves one in each process."""
+    jobs: Count = 1
+    """Processes that drive, in Chrono."""
+    vehicle: str | None = None
+    """Name or YAML file of another vehicle than the policy's training was meant for."""
+    terrain: Path | None = None
+    """A Verti-Bench checkout or a folder of .npz maps, to drive on all of them."""
+    obstacles: bool = False
+    """Whether the rocks and trees of these maps stand there."""
+    suites: tuple[Suite, ...] = ()
+    """Kinds of procedural worlds; all three by default."""
+    suite_worlds: Count | None = None
+    """How many worlds of each suite; as many as after training by default."""
+    pairs: Count | None = None
+    """Tasks in a world; as many as after training by default."""
+    seed: int | None = None
+    """Draws other procedural worlds than those held out."""
+    sensing_range: float | None = None
+    """Range of sensors, m, inf to know all of the map; by default as in training."""
+    output: Path | None = None
+    """Folder for tables, all episodes and pictures."""
+
+    def check(self):
+        drawn = ("suites", "suite_worlds", "seed")
+        found = [name for name in drawn if getattr(self, name) not in ((), None)]
+        if self.terrain and found:
+            raise ValueError(f"{found[0]}: is of procedural worlds, give it or terrain")
+        if self.obstacles and not self.terrain:
+            raise ValueError("obstacles: is of given worlds; procedural ones are a suite")
+        if self.planning is not None and not isinstance(self.policy, Path):
+            raise ValueError(f"planning: is of the policy of a run, found {self.policy}")
+        if self.jobs > 1 and self.simulator != "chrono":
+            raise ValueError(f"jobs: expected 1 in all simulators but Chrono, found {self.jobs}")
+
+    def run(self) -> str:
+        """Runs the test and writes what `output` asks for; returns the tables as Markdown."""
+        run = self.policy if isinstance(self.policy, Path) else None
+        file = run / "config.yaml" if run else configuration.default_config("ppo")
+        trained = experiment.load(file)
+        config = self.changed(trained)
+        external.expect(self.simulator, config)
+        if self.terrain:
+            scale, obstacles = config.driven.scale, config.ground.obstacles
+            terrain = files.load_map(self.terrain, scale=scale, obstacles=obstacles)
+        else:
+            terrain = experiment.held_out(config)
+        policies = dict(config.baselines)
+        if run:
+            # It plans as it was trained, also where it knows less of the map.
+            own = replace(config, navigation=trained.navigation)
+            policies = experiment.learned(own, run) | policies
+        elif self.policy == "straight":
+            policies = {REFERENCE: policies[REFERENCE]}
+        elif self.policy != "random":
+            policies = {str(self.policy): self._planner(config)} | policies
+        where = terrain, policies, config.world_suites
+        groups = drive(config, *where, self.simulator, self.jobs)
+        if self.output:
+            write(self.output, groups, terrain, config.navigation.goal_radius)
+        return markdown(groups)
+
+    def changed(self, config: TrainConfig) -> TrainConfig:
+        """The settings of a training with the test that is asked for."""
+        asked = {name: getattr(self, name) for name in ("suites", "suite_worlds", "pairs")}
+        ground = {name: value for name, value in asked.items() if value}
+        asked = {name: getattr(self, name) for name in ("terrain", "vehicle", "seed")}
+        changes = {name: value for name, value in asked.items() if value is not None}
+        if self.terrain:
+            ground["obstacles"] = self.obstacles
+        elif self.suites or self.seed is not None:
+            changes["terrain"] = None
+        if self.sensing_range is not None:
+            sensing = replace(config.navigation.sensing, range=self.sensing_range)
+            changes["navigation"] = replace(config.navigation, sensing=sensing)
+        if self.planning is not None:
+            own = config.planning or ImprovementConfig()
+            changes["planning"] = own if self.planning else None
+        return replace(config, ground=replace(config.ground, **ground), **changes)
+
+    def _planner(self, config: TrainConfig) -> Agent:
+        by_gradients = self.policy == "shooting"
+        model = (self.shooting if by_gradients else self.mppi).model
+        dynamics, weights = experiment.dynamics(config, model, by_gradients)
+        env = NavigationEnv(dynamics, config.navigation)
+        if by_gradients:
+            return Shooting(env=env, dynamics=weights, config=self.shooting)
+        return MPPI(env=env, dynamics=weights, config=self.mppi)
+
+
 def after_training(trained: Trained) -> str:
     """Tests what a training has learned, beside controllers, on the worlds held out.
 
-    Leaves tables and pictures in the folder of the run, also of how it learned; the tables as text.
+    Writes tables and pictures into the folder of the run, also of how it learned. Returns the
+    tables as Markdown.
     """
     config, folder = trained.config, trained.folder
     columns = runs.read_columns(folder)
     labels = {name: label for name, label in CURVES.items() if name in columns}
-    figure = plots.learning_curves({config.name: columns}, "timesteps", labels, "steps of 0.1 s")
+    figure = plots.learning_curves({config.name: columns}, "timesteps", labels)
     figures.save(figure, folder / "learning_curves.png")
     machine.forget_programs()  # Tests need the memory.
-    test = experiment.test_environment(config, trained.held_out)
     policies = experiment.learned(config, folder) | config.baselines
-    key = config.key("testing")
-    groups = drive(test.env, test.params, policies, key, trained.world_suites)
-    write(folder, groups, REFERENCE, test.params.terrain, config.navigation.goal_radius)
-    return markdown(groups, REFERENCE)
+    groups = drive(config, trained.held_out, policies, trained.world_suites)
+    write(folder, groups, trained.held_out, config.navigation.goal_radius)
+    return markdown(groups)
 
 
 def drive(
-    env: NavigationEnv,
-    params: TaskParams,
+    config: TaskConfig,
+    terrain: TerrainMap,
     policies: Mapping[str, Policy | Agent],
-    key: jax.Array,
-    suites: Sequence[str] | None = None,
-    judge: Judge = run_episodes,
+    suites: Sequence[str] | None,
+    simulator: Arena = "builtin",
+    jobs: int = 1,
 ) -> dict[str, Results]:
-    """Drives all tasks of the pool with each policy; the results by suite.
+    """Drives all tasks of a test with each policy.
 
-    suites: that of each world; None where the worlds are a user's own maps.
+    Args:
+        config: what the task is, and how many tasks a world has.
+        terrain: the worlds.
+        policies: what drives, by name.
+        suites: that of each world; None where the worlds are a user's own maps.
+        simulator: what moves the vehicle.
+        jobs: processes that drive, in Chrono.
+
+    Returns:
+        The episodes, by suite and policy.
     """
-    _log.info("driving %d tasks on %d worlds ...", params.pool_size, params.terrain.worlds)
+    model = "builtin" if simulator == "chrono" else simulator
+    test, key = experiment.test_environment(config, terrain, model), config.key("testing")
+    _log.info("driving %d tasks on %d worlds ...", test.params.pool_size, terrain.worlds)
     results = {}
-    for name, policy in policies.items():
-        start = time.perf_counter()
-        results[name] = judge(env, params, policy, key)
-        solved, seconds = int(np.sum(results[name].success)), time.perf_counter() - start
-        _log.info("  %s: %d solved, compiled and driven in %.0f s", name, solved, seconds)
-    return by_suite(results, suites or [GIVEN_MAPS] * params.terrain.worlds)
+    with processes.simulating(jobs) as mapped:
+        for name, policy in policies.items():
+            start = time.perf_counter()
+            inputs = test.env, test.params, policy, key
+            if simulator == "chrono":
+                tasks = test_tasks(config.ground, terrain)
+                results[name] = external.evaluate(Chrono, mapped, tasks, *inputs)
+            else:
+                results[name] = run_episodes(*inputs)
+            solved, seconds = int(np.sum(results[name].success)), time.perf_counter() - start
+            _log.info("  %s: %d solved, compiled and driven in %.0f s", name, solved, seconds)
+    return by_suite(results, suites or [GIVEN_MAPS] * terrain.worlds)
 
 
 def by_suite(results: Results, suites: Sequence[str]) -> dict[str, Results]:
@@ -98,53 +228,61 @@ def by_suite(results: Results, suites: Sequence[str]) -> dict[str, Results]:
 
 
 def write(
-    folder: Path,
-    groups: Mapping[str, Results],
-    reference: str,
-    terrain: TerrainMap,
-    goal_radius: float,
+    folder: Path, groups: Mapping[str, Results], terrain: TerrainMap, goal_radius: float
 ) -> None:
     """`summary.md`, `summary.json`, `episodes.csv`, and a picture of a hard task of each suite."""
-    folder.mkdir(parents=True, exist_ok=True)
-    atomic.write(folder / "summary.md", markdown(groups, reference) + "\n")
-    numbers = json.dumps(summary(groups, reference), indent=2)
-    atomic.write(folder / "summary.json", numbers + "\n")
-    atomic.write(folder / "episodes.csv", csv_text(_episodes(groups)))
+    drawn = {}
     for name, results in groups.items():
-        hard = _hard_task(results, reference)
+        hard = _hard_task(results)
         first = next(iter(results.values()))
-        figure = plots.trajectories(
-            terrain,
-            int(first.world[hard]),
-            {policy: result.path(hard) for policy, result in results.items()},
-            np.asarray(first.goal[hard]),
-            goal_radius,
-            STEP_SECONDS,
-        )
-        figures.save(figure, folder / f"trajectories_{name.replace(', ', '_')}.png")
+        paths = {policy: result.path(hard) for policy, result in results.items()}
+        goal = np.asarray(first.goal[hard]), goal_radius
+        figure = plots.trajectories(terrain, int(first.world[hard]), paths, *goal, STEP_SECONDS)
+        drawn[f"trajectories_{name}.png"] = figure
+    texts = {
+        "summary.md": markdown(groups) + "\n",
+        "summary.json": json.dumps(summary(groups), indent=2) + "\n",
+        "episodes.csv": csv_text(_episodes(groups)),
+    }
+    write_files(folder, texts | drawn)
 
 
-def markdown(groups: Mapping[str, Results], reference: str) -> str:
-    """A table for each group, and how many tasks that `reference` fails the others solve."""
-    return "\n\n".join(_section(name, results, reference) for name, results in groups.items())
+def markdown(groups: Mapping[str, Results]) -> str:
+    """A table for each suite, and how many tasks that straight to goal fails the others solve."""
+    sections = []
+    for suite, rows in summary(groups).items():
+        section = f"**{suite}**\n\n{navigation.format_table(rows)}"
+        solved = [
+            f"{policy} {row['solved_of_reference_failures']}"
+            for policy, row in rows.items()
+            if policy != REFERENCE
+        ]
+        if solved:
+            failures = rows[REFERENCE]["tasks"] - rows[REFERENCE]["successes"]
+            section += f"\n\nSolved of the {failures} tasks that {REFERENCE} fails: "
+            section += ", ".join(solved)
+        sections.append(section)
+    return "\n\n".join(sections)
 
 
-def summary(groups: Mapping[str, Results], reference: str) -> dict[str, Any]:
+def summary(groups: Mapping[str, Results]) -> dict[str, dict[str, dict[str, Any]]]:
     """The same as plain numbers, for JSON; what has no value is None."""
     return {
-        name: {
+        suite: {
             policy: {
-                **_plain(Summary.of(result)),
-                "solved_of_reference_failures": _rescued(result, results[reference]),
+                **navigation.summary(result),
+                "solved_of_reference_failures": int(
+                    np.sum(np.asarray(result.success) & ~np.asarray(results[REFERENCE].success))
+                ),
             }
             for policy, result in results.items()
         }
-        for name, results in groups.items()
+        for suite, results in groups.items()
     }
 
 
-def _episodes(groups: Mapping[str, Results]) -> list[dict[str, str | float]]:
-    """One line for each episode."""
+def _episodes(groups: Mapping[str, Results]) -> list[Row]:
+    """A row for each episode."""
     return [
         {
             "suite": suite,
@@ -166,31 +304,8 @@ def _episodes(groups: Mapping[str, Results]) -> list[dict[str, str | float]]:
     ]
 
 
-def _hard_task(results: Results, reference: str) -> int:
-    """The first task that the reference fails, better still one that the first policy solves."""
-    failed = ~np.asarray(results[reference].success)
+def _hard_task(results: Results) -> int:
+    """The first task that straight to goal fails, better one that the first policy solves."""
+    failed = ~np.asarray(results[REFERENCE].success)
     solved = np.asarray(next(iter(results.values())).success)
     return int(np.argmax(2 * failed + solved))
-
-
-def _plain(row: Summary) -> dict[str, Any]:
-    values = dataclasses.asdict(row)
-    return {name: None if value != value else value for name, value in values.items()}
-
-
-def _section(name: str, results: Results, reference: str) -> str:
-    table = format_table({policy: Summary.of(result) for policy, result in results.items()})
-    others = [policy for policy in results if policy != reference]
-    if not others:
-        return f"**{name}**\n\n{table}"
-    failures = int(np.sum(~np.asarray(results[reference].success)))
-    rescued = ", ".join(
-        f"{policy} {_rescued(results[policy], results[reference])}" for policy in others
-    )
-    return (
-        f"**{name}**\n\n{table}\n\nSolved of the {failures} tasks that {reference} fails: {rescued}"
-    )
-
-
-def _rescued(result: NavigationResult, reference: NavigationResult) -> int:
-    return int(np.sum(np.asarray(result.success) & ~np.asarray(reference.success)))

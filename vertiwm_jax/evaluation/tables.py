@@ -1,22 +1,52 @@
-"""Tables in Markdown and CSV."""
+"""Tables in Markdown and CSV, and the files that a test writes."""
+
+from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vertiwm_jax import atomic, figures
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Row = Mapping[str, "str | float"]
+"""A row of a table, by the names of its columns."""
 
 
-def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table with a line for each row, whose cells are in the order of `heads`."""
-    lines = [heads, *rows]
-    head, *body = (f"| {' | '.join(cells)} |" for cells in lines)
-    return "\n".join([head, "|" + "---|" * len(heads), *body])
+def write(folder: Path, files: Mapping[str, str | Figure]) -> None:
+    """Writes texts and figures, by file name, into a folder, which is made if there is none.
+
+    Raises `WriteError`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, content in files.items():
+        if isinstance(content, str):
+            atomic.write(folder / name, content)
+        else:
+            figures.save(content, folder / name)
 
 
-def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
+def markdown(rows: Sequence[Row]) -> str:
+    """Rows with equal keys as a Markdown table with aligned columns; floats have three digits."""
+    cells = [list(rows[0]), *([_cell(value) for value in row.values()] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    cells.insert(1, ["-" * width for width in widths])
+    lines = (" | ".join(map(str.ljust, row, widths)) for row in cells)
+    return "\n".join(f"| {line} |" for line in lines)
+
+
+def csv_text(rows: Sequence[Row]) -> str:
     """Rows with equal keys as CSV, with a header line."""
     table = io.StringIO()
     writer = csv.DictWriter(table, list(rows[0]))
     writer.writeheader()
     writer.writerows(rows)
     return table.getvalue()
+
+
+def _cell(value: str | float) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -11,7 +11,7 @@ import numpy as np
 
 from vertiwm_jax import atomic, froude
 from vertiwm_jax import config as configuration
-from vertiwm_jax.evaluation.tables import markdown
+from vertiwm_jax.evaluation.tables import Row, markdown
 from vertiwm_jax.importers import grid_map, resampling, rosbag, table
 from vertiwm_jax.importers.log import Log
 from vertiwm_jax.importers.resampling import Drive
@@ -70,7 +70,7 @@ def import_drives(
     readers = [_reader(source, format) for source in sources]
     with atomic.new_folder(output) as unfinished:
         terrain, said = _terrain(sources, settings_file, settings, map)
-        drives, rows = list[Drive](), list[list[str]]()
+        drives, rows = list[Drive](), list[Row]()
         with Progress(len(sources), "logs") as progress:
             for source, read in zip(sources, readers, strict=True):
                 found, row = _import(source, read, settings, terrain)
@@ -78,7 +78,7 @@ def import_drives(
                 rows.append(row)
                 progress.advance(1, source.name)
         if not drives:
-            reasons = "; ".join(row[-1] for row in rows)
+            reasons = "; ".join(str(row["left out"]) for row in rows)
             raise DataError(
                 f"{sources[0]}: expected a drive or more that can be used, found none: {reasons}"
             )
@@ -89,9 +89,8 @@ def import_drives(
         for number, first in enumerate(range(0, len(drives), PER_FILE)):
             some = _arrays(drives[first : first + PER_FILE])
             schema.write(unfinished / f"drives_{number:03d}.npz", some, meta, wheels)
-    heads = ["log", "poses a second", "from poses", "drives", "steps", "left out"]
     remarks = _remarks(drives, terrain, settings.vehicle.scale)
-    return "\n".join([markdown(heads, rows), "", *said, *remarks])
+    return "\n".join([markdown(rows), "", *said, *remarks])
 
 
 def _reader(source: Path, asked: Format | None) -> Reader:
@@ -127,7 +126,7 @@ def _terrain(
 
 def _import(
     source: Path, read: Reader, settings: ImportSettings, terrain: TerrainMap
-) -> tuple[list[Drive], list[str]]:
+) -> tuple[list[Drive], Row]:
     """The drives of a source that are on the map, and its row of the table.
 
     Raises `DataError` unless all drives are of the schema, and move where they say.
@@ -156,14 +155,14 @@ def _import(
     reasons = ", ".join(f"{count} {why}" for why, count in left_out.items() if count)
     apart = np.median(np.concatenate([np.diff(log.time) for log in logs]))
     derived = {"velocity": logs[0].velocity, "angular velocity": logs[0].angular_velocity}
-    return kept, [
-        str(source),
-        f"{scale**0.5 / apart:.1f}",
-        ", ".join(name for name, logged in derived.items() if logged is None) or "-",
-        str(len(kept)),
-        f"{sum(len(drive.control) for drive in kept):,}",
-        reasons or "-",
-    ]
+    return kept, {
+        "log": str(source),
+        "poses a second": f"{scale**0.5 / apart:.1f}",
+        "from poses": ", ".join(name for name, logged in derived.items() if logged is None) or "-",
+        "drives": len(kept),
+        "steps": f"{sum(len(drive.control) for drive in kept):,}",
+        "left out": reasons or "-",
+    }
 
 
 def _arrays(drives: Sequence[Drive]) -> dict[str, np.ndarray]:

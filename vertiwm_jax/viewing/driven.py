@@ -14,7 +14,7 @@ from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.suites import Suite
 from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason
-from vertiwm_jax.evaluation.prediction import modelled
+from vertiwm_jax.evaluation.prediction import modeled_wheels
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.state import STEP_SECONDS
@@ -75,7 +75,7 @@ def drive(
         """The state, the command that led there, wheels and coefficients."""
         command = task.vehicle.command(state.action, env.config.speed_range).vector
         alpha = getattr(state.history, "coefficients", None)
-        return state.vehicle.vector, command, modelled(state.history), alpha
+        return state.vehicle.vector, command, modeled_wheels(state.history), alpha
 
     found = jax.tree.map(lambda x: np.asarray(x)[0], run_episodes(env, task, agent, key, shown))
     steps = int(found.steps)

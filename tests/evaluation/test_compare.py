@@ -5,8 +5,7 @@ import pytest
 
 from vertiwm_jax.env.episodes import NavigationResult
 from vertiwm_jax.env.termination import TerminationReason as Reason
-from vertiwm_jax.evaluation import policy_table
-from vertiwm_jax.evaluation.policy_table import TrainingCost
+from vertiwm_jax.evaluation import compare
 
 
 def result(reached: int) -> NavigationResult:
@@ -35,20 +34,21 @@ def test_costs_are_of_all_sessions_of_a_training(tmp_path):
         {"step": 3, "wall_time": 9999.0, "timesteps": 1800, "timesteps_per_second": 200.0},
     ]
     (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
-    cost = TrainingCost.of(tmp_path)
-    assert cost.seconds == pytest.approx(6 + 12 + 3) and cost.timesteps == 1800
+    seconds, steps = compare.cost(tmp_path)
+    assert seconds == pytest.approx(6 + 12 + 3) and steps == 1800
 
 
 def test_every_simulator_has_a_table_of_all_policies():
-    costs = {"ppo in vertiwm": TrainingCost(120.0, 360_000)}
+    costs = {"ppo in vertiwm": (120.0, 360_000)}
     easy = {"ppo in vertiwm": result(3), "straight to goal": result(0)}
     hard = {"ppo in vertiwm": result(1), "straight to goal": result(2)}
-    judged = {"builtin": {"easy": easy, "hard": hard}, "vertiwm": {"easy": hard}}
-    text = policy_table.markdown(costs, judged)
-    first, second = text.split("**vertiwm**")
-    learned, straight = first.strip().splitlines()[-2:]
+    tested = {"builtin": {"easy": easy, "hard": hard}, "vertiwm": {"easy": hard}}
+    first, second = compare.markdown(costs, tested).split("**vertiwm**")
+    learned, straight = (
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in first.strip().splitlines()[-2:]
+    )
     level = "0.0 / 0.0 deg"
-    solved = f"3/4, 10.0 s, {level} | 1/4, 10.0 s, {level}"
-    assert learned.startswith(f"| ppo in vertiwm | 2.0 | 3,000 | {solved} | 19/20")
-    assert straight == f"| straight to goal |  |  | 0/4, {level} | 2/4, 10.0 s, {level} |  |"
+    solved = [f"3/4, 10.0 s, {level}", f"1/4, 10.0 s, {level}"]
+    assert learned == ["ppo in vertiwm", "2.0", "3,000", *solved]
+    assert straight == ["straight to goal", "", "", f"0/4, {level}", f"2/4, 10.0 s, {level}"]
     assert "hard" not in second and f"| 1/4, 10.0 s, {level} |" in second
