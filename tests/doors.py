@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +14,12 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from vertiwm_jax import cli
 from vertiwm_jax import config as configuration
+from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.rl import experiment, policy
 from vertiwm_jax.rl.experiment import TrainConfig
 from vertiwm_jax.rl.learned import DeterministicPolicy
+from vertiwm_jax.rl.policy import Base, Policy, PolicyConfig
 from vertiwm_jax.terrain.map import TerrainMap
 
 Door = Callable[[Sequence[str]], None]
@@ -54,6 +58,22 @@ def refusal(door: Door, *argv: object) -> str:
     message = stop.value.code
     assert isinstance(message, str) and message.startswith("error: ") and "\n" not in message
     return message
+
+
+def exportable(learned: DeterministicPolicy, base: Base, task: NavigationConfig) -> Policy:
+    """A policy that corrects a controller, as if it had been trained; it has no critic."""
+    config = PolicyConfig(
+        algorithm="ppo",
+        hidden=(),
+        initial_log_std=None,
+        navigation=task,
+        base=base,
+        action_repeat=8,
+        discount=0.99,
+        vehicle=vehicle.load("hmmwv"),
+        model="builtin",
+    )
+    return Policy(learned, cast(Any, None), config.controller, config)
 
 
 def untrained(kind: type[TrainConfig], run: Path) -> list[DeterministicPolicy]:

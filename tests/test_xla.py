@@ -25,7 +25,7 @@ def test_flags_that_xla_does_not_know_are_left_out(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=1")
     xla.add_flags({KNOWN: 1, UNKNOWN: 1, "xla_force_host_platform_device_count": 2})
     assert os.environ["XLA_FLAGS"] == f"--xla_force_host_platform_device_count=1 --{KNOWN}=1"
-    assert UNKNOWN in xla.left_out() and KNOWN not in xla.left_out()
+    assert UNKNOWN in xla._left_out and KNOWN not in xla._left_out
 
 
 def test_flags_that_stand_there_are_not_tried_again(monkeypatch):
@@ -51,7 +51,7 @@ def test_compiler_options_that_xla_does_not_know_are_left_out(monkeypatch):
 
     brief = xla.brief_jit(doubled)
     assert [float(brief(jnp.float32(x))) for x in (1, 2)] == [2, 4] and len(calls) == 1
-    assert xla.left_out() == [UNKNOWN]
+    assert xla._left_out == {UNKNOWN}
     with pytest.raises(jax.errors.JaxRuntimeError, match=UNKNOWN):
         jax.jit(doubled, compiler_options={UNKNOWN: 1})(jnp.float32(1))
 

@@ -7,18 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import onnxruntime
 import pytest
+from doors import exportable
 from faults.border import fault
 
 from vertiwm_jax.deploy import description, onnx_graph, run_policy, stablehlo
-from vertiwm_jax.env.controllers import LookAhead
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.networks.policy import Actor, ObservationLayout
-from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy
+from vertiwm_jax.rl.learned import DeterministicPolicy
 from vertiwm_jax.rl.running_statistics import RunningStatistics
-
-CONFIG = NavigationConfig()
 
 
 @pytest.fixture(scope="module")
@@ -27,19 +24,16 @@ def policy():
     weights = actor.init(jax.random.key(0), jnp.zeros(OBSERVATION_SIZE))
     mean, variance = jnp.zeros(OBSERVATION_SIZE), jnp.ones(OBSERVATION_SIZE)
     learned = DeterministicPolicy(actor, weights, RunningStatistics(mean, variance, jnp.float32(9)))
-    return ResidualPolicy(LookAhead(CONFIG), learned)
+    return exportable(learned, "look ahead", NavigationConfig())
 
 
 @pytest.fixture(scope="module", params=["onnx", "stablehlo"])
 def act(request, policy):
     """Observations to actions, as a robot computes them."""
     if request.param == "stablehlo":
-        made = stablehlo.policy(lambda seen: policy(seen, jax.random.key(0)), OBSERVATION_SIZE)
+        made = stablehlo.policy(policy, OBSERVATION_SIZE)
         return jax.export.deserialize(bytearray(made)).call
-    about, weights = (
-        description.about(policy, CONFIG, load_vehicle(), 4),
-        description.weights(policy),
-    )
+    about, weights = description.about(policy), description.weights(policy)
     made = onnx_graph.record(partial(run_policy.act, about, weights), OBSERVATION_SIZE, 2)
     session = onnxruntime.InferenceSession(made, providers=["CPUExecutionProvider"])
     return lambda seen: session.run(["action"], {"observation": seen})[0]

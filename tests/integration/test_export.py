@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import onnxruntime
 import pytest
-from doors import door, refusal, untrained
+from doors import door, exportable, refusal, untrained
 from env.worlds import SNOW, bicycle_env, hills, task
 from flax import struct
 
@@ -17,7 +17,7 @@ from vertiwm_jax import atomic
 from vertiwm_jax import config as configuration
 from vertiwm_jax.deploy import export, onnx_graph, run_policy, stablehlo
 from vertiwm_jax.env import observation, route
-from vertiwm_jax.env.controllers import LookAhead, StraightToGoal
+from vertiwm_jax.env.controllers import LookAhead
 from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
@@ -40,7 +40,6 @@ ACTORS = {
     "td3": TanhNormalActor(2, (8,), None, ObservationLayout(ARCS)),
     "embeddings": Actor(2, (8, 6), -0.5, ObservationLayout(ARCS, EMBEDDING_SHAPE)),
 }
-BASES = {"look ahead": LookAhead(CONFIG), "straight to goal": StraightToGoal(CONFIG), "none": None}
 TINY = """
 ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 1}
 simulator: {substeps: 1}
@@ -66,7 +65,7 @@ def policy_of(actor, base):
     mean, variance = jnp.float32(rng.uniform(size=(2, size)))
     statistics = RunningStatistics(mean, variance, jnp.float32(9))
     learned = DeterministicPolicy(actor, jax.tree.map(drawn, shapes), statistics)
-    return ResidualPolicy(base, learned) if base else learned
+    return exportable(learned, base, CONFIG)
 
 
 def observations(image=None):
@@ -93,7 +92,7 @@ def in_onnx(model, seen):
 
 def written(policy, folder):
     """The files of a policy, as on a robot, and the policy in NumPy."""
-    made = export.files(policy, None, CONFIG, load_vehicle(), 8, onnx_graph.record)
+    made = export.files(policy)
     for name, data in made.items():
         atomic.write(folder / name, data)
     return made, run_policy.load(folder)
@@ -110,7 +109,7 @@ def act(policy, seen):
     [(actor, "look ahead") for actor in ACTORS] + [("ppo", "straight to goal"), ("sac", "none")],
 )
 def test_all_forms_of_a_policy_agree(actor, base, tmp_path):
-    policy, seen = policy_of(ACTORS[actor], BASES[base]), observations(ACTORS[actor].layout.image)
+    policy, seen = policy_of(ACTORS[actor], base), observations(ACTORS[actor].layout.image)
     made, in_numpy = written(policy, tmp_path)
     in_stablehlo = jax.export.deserialize(bytearray(made["policy.stablehlo"])).call
     expected = np.asarray(act(policy, seen))
@@ -135,7 +134,7 @@ def test_all_forms_of_a_policy_agree(actor, base, tmp_path):
 
 
 def test_observations_that_are_none_are_named(tmp_path):
-    _, in_numpy = written(policy_of(ACTORS["ppo"], None), tmp_path)
+    _, in_numpy = written(policy_of(ACTORS["ppo"], "none"), tmp_path)
     with pytest.raises(ValueError, match=r"expected \[\.\.\., 475\], found \(7,\)"):
         in_numpy(np.zeros(7))
     with pytest.raises(ValueError, match="expected finite numbers"):
@@ -159,7 +158,7 @@ class Robot:
 
 
 def test_the_robot_drives_as_the_test_does(tmp_path):
-    policy = policy_of(ACTORS["ppo"], BASES["look ahead"])
+    policy = policy_of(ACTORS["ppo"], "look ahead")
     terrain = TerrainMap.from_array(hills(), np.full((16, 16), SNOW))
     config = NavigationConfig(speed_range=CONFIG.speed_range, horizon_seconds=4.0)
     env, params = bicycle_env(terrain, task((-20.0, 0.0), (20.0, 5.0)), config)

@@ -46,7 +46,7 @@ def test_predictions_from_recorded_states(tmp_path):
 def test_coefficients_of_the_predicted_steps(tmp_path):
     scene = recorded.load(recordings.write(tmp_path), 0, "fused", Fused(), None)
     np.testing.assert_allclose(scene.prediction.coefficients[0, :, 2], 16 + np.arange(1, 17))
-    np.testing.assert_allclose(scene.prediction.states[0], np.tile(scene.state[16], (16, 1)))
+    np.testing.assert_allclose(scene.prediction.state[0, 1:], np.tile(scene.state[16], (16, 1)))
 
 
 def test_drives_that_are_none_are_named(tmp_path):

@@ -44,7 +44,7 @@ def test_all_of_the_scene_is_there(found):
     entities, full = found[0], scene()
     assert set(entities) >= {
         "world/terrain", "world/obstacles", "world/goal", "world/goal/ring", "world/path",
-        "world/predictions", "world/predicted", "world/vehicle/body",
+        "world/predictions", "world/vehicle/body", "world/vehicle/cabin", "map",
         "world/vehicle/wheels/front\\ left", "world/vehicle/wheels/rear\\ right/spoke",
     }  # fmt: skip
     mesh = entities["world/terrain"]
@@ -61,8 +61,6 @@ def test_all_of_the_scene_is_there(found):
     turned = np.squeeze(entities["world/vehicle/wheels/rear\\ right"]["Transform3D:quaternion"])
     expected = np.sin(0.25 * np.arange(1, 4))
     np.testing.assert_allclose(turned[:3], [[0, y, 0, np.sqrt(1 - y * y)] for y in expected])
-    predicted = entities["world/predicted"]
-    assert predicted["step"] == list(range(5, 17))
     drawn = {entity.split("/", 1)[1] for entity in entities if entity.startswith("plots/")}
     assert len(drawn) == sum(map(len, panels(full).values()))
     speed = entities["plots/speed\\ \\[m\\/s\\]/commanded"]["Scalars:scalars"]
@@ -73,7 +71,7 @@ def test_a_drive_alone(tmp_path):
     recording.write(bare(), tmp_path / "bare.rrd")
     entities, _ = read(tmp_path / "bare.rrd")
     assert "world/vehicle" in entities
-    assert not {"world/goal", "world/predicted", "world/predictions"} & set(entities)
+    assert not {"world/goal", "world/predictions"} & set(entities)
 
 
 def test_a_recording_that_fails_leaves_the_old_one(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ from where it was, with the soils believed now, and where it really went correct
 """
 
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jax.scipy.special import logit
 from vertiwm_jax.adaptation import kalman
 from vertiwm_jax.adaptation.kalman import Gaussian
 from vertiwm_jax.config import Bounds, Count, CountOrZero, Positive, settings
-from vertiwm_jax.dynamics import Dynamics, History, Params
+from vertiwm_jax.dynamics import Dynamics, Params, rollout, warm_up
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -23,6 +23,7 @@ from vertiwm_jax.terrain.soil import from_unit, to_unit
 from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.nesam import Nesam
 
+T = TypeVar("T")
 MARGIN = 0.05
 """Share of `BOUNDS` from either end within which the filter starts: beyond, nothing would move."""
 LONGEST_STEP = 1.0
@@ -36,7 +37,7 @@ class SoilBelief:
     soils: leaves `[K, 6]` and `[K, 6, 6]`, logits of where in `BOUNDS` each parameter lies; rows
         of rigid classes are never used but finite.
     states: `[C + H + 1, 12]`, the newest last. commands: `[C + H, 2]`, those between them.
-    steps: `[]` int32, of the drive so far.
+    steps: `[]` int32, of the drive so far; with 0 another drive begins.
     accepted, refused: `[K]` int32, measurements of each class so far.
     """
 
@@ -95,11 +96,6 @@ class SoilFilter:
             refused=none,
         )
 
-    def begin(self, belief: SoilBelief, state: VehicleState) -> SoilBelief:
-        """What is believed of the soils, at the start of another drive."""
-        states = jnp.broadcast_to(state.vector, belief.states.shape)
-        return replace(belief, states=states, steps=jnp.int32(0))
-
     def update(
         self,
         model: Dynamics,
@@ -140,11 +136,11 @@ class SoilFilter:
         soils from the map, or whose gradients are not exact.
         """
         _check(model, params)
+        c = self.context
         states = VehicleState.from_vector(belief.states)
-        start, end = (jax.tree.map(lambda x, i=i: x[i], states) for i in (0, -1))
         commands = Command.from_vector(belief.commands)
-        given = jnp.arange(len(belief.commands)) <= self.context
-        kinds = query.surface(terrain, states.position[self.context :, :2]).semantic
+        known, start, end = (_at(states, place) for place in (slice(c + 1), c, -1))
+        kinds = query.surface(terrain, states.position[c:, :2]).semantic
         kind = kinds[-1]
         aged = self._aged(terrain, belief.soils)
 
@@ -152,21 +148,14 @@ class SoilFilter:
             """How the end of the buffer differs from what these logits of the soil predict."""
             soils = replace(aged, mean=aged.mean.at[kind].set(mean))
             ground = believed(terrain, replace(belief, soils=soils))
-
-            def advance(
-                carry: tuple[VehicleState, History], inputs: tuple[jax.Array, VehicleState, Command]
-            ) -> tuple[tuple[VehicleState, History], None]:
-                (state, history), (known, recorded, command) = carry, inputs
-                state = jax.tree.map(lambda x, y: jnp.where(known, x, y), recorded, state)
-                return model.step(params, ground, history, state, command), None
-
-            before = jax.tree.map(lambda x: x[:-1], states)
-            first = start, model.init(params, ground, start)
-            (predicted, _), _ = jax.lax.scan(advance, first, (given, before, commands))
-            return motion.increment(predicted, end) / jnp.asarray(self.noise)
+            history = warm_up(model, params, ground, known, _at(commands, slice(c)))
+            predicted = rollout(
+                model, params, ground, start, _at(commands, slice(c, None)), history
+            )
+            return motion.increment(_at(predicted, -1), end) / jnp.asarray(self.noise)
 
         posterior, plausible = kalman.correct(
-            jax.tree.map(lambda x: x[kind], aged),
+            _at(aged, kind),
             residual,
             self.gate,
             self.iterations,
@@ -205,6 +194,10 @@ def believed(terrain: TerrainMap, belief: SoilBelief) -> TerrainMap:
     """The map with the soils that are believed in: what a model is to drive on."""
     unit_weight = query.soils(terrain).unit_weight
     return terrain.with_soils(from_unit(jax.nn.sigmoid(belief.soils.mean), unit_weight))
+
+
+def _at(tree: T, place: Any) -> T:
+    return jax.tree.map(lambda x: x[place], tree)
 
 
 def _check(model: Dynamics, params: Params) -> None:

@@ -1,7 +1,7 @@
 """The command line: `vertiwm COMMAND ...`, for most also `python -m vertiwm_jax.COMMAND ...`.
 
-Each module of this package is one command, or several that differ in a name: `run` reads the rest
-of the command line, calls the library, and prints what came of it.
+Each module of this package is one command, and `train` all that train policies: `run` reads the
+rest of the command line, calls the library, and prints what came of it.
 """
 
 import gc
@@ -17,21 +17,11 @@ import jax
 from vertiwm_jax import hosts, machine
 from vertiwm_jax.errors import TrainingInterrupted, UserError
 
-COMMANDS = {
-    "ppo": "train",
-    "sac": "train",
-    "td3": "train",
-    "fit": "fit",
-    "evaluate": "evaluate",
-    "compare": "compare",
-    "collect": "collect",
-    "import_drives": "import_drives",
-    "make_logs": "make_logs",
-    "export": "export",
-    "view": "view",
-    "identify": "identify",
-}
-"""Commands, and the modules that run them."""
+_TRAININGS = ("ppo", "sac", "td3")
+COMMANDS = (
+    *_TRAININGS, "fit", "evaluate", "compare", "collect", "import_drives", "make_logs", "export",
+    "view", "identify",
+)  # fmt: skip
 _RESUME = "go on from the newest checkpoint with --resume and the run folder"
 GOING_ON = dict.fromkeys(hosts.COMMANDS, _RESUME) | {
     "compare": "go on with --resume and the run folder",
@@ -59,7 +49,8 @@ def main(name: str | None = None, words: Sequence[str] | None = None) -> None:
     if own:
         prepare(name)
     with failures_in_one_line(name), told():
-        import_module(f"{__name__}.{COMMANDS[name]}").run(name, words)
+        module = "train" if name in _TRAININGS else name
+        import_module(f"{__name__}.{module}").run(name, words)
 
 
 def prepare(name: str) -> None:

@@ -7,5 +7,5 @@ from vertiwm_jax.evaluation.compare import CompareConfig, compare
 
 
 def run(name: str, words: Sequence[str]) -> None:
-    config = arguments.resumable(CompareConfig, "table3", name, words)
+    config = arguments.with_file(CompareConfig, "table3", name, words)
     print(f"\n{compare(config)}")

@@ -20,7 +20,7 @@ CURVES = {
 
 
 def run(name: str, words: Sequence[str]) -> None:
-    config = arguments.resumable(FitConfig, "fit_chrono", name, words)
+    config = arguments.with_file(FitConfig, "fit_chrono", name, words)
     folder = experiment.run(config)
     _draw(folder)
     print(f"the model is in {folder / 'model'}; how well it predicts:")

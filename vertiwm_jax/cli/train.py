@@ -8,7 +8,7 @@ from vertiwm_jax.rl import experiment
 
 
 def run(name: str, words: Sequence[str]) -> None:
-    config = arguments.resumable(experiment.TRAININGS[name], name, name, words)
+    config = arguments.with_file(experiment.TRAININGS[name], name, name, words)
     trained = experiment.run(config)
     print(f"\n{report.after_training(trained)}\n")
     print(f"all of it is in {trained.folder}")

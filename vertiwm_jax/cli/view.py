@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import tyro
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import ConfigError, CountOrZero, settings
 from vertiwm_jax.env.suites import Suite
-from vertiwm_jax.errors import UserError
+from vertiwm_jax.errors import UserError, needs
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.models.registry import ModelName, load_model
@@ -45,12 +45,12 @@ class View:
     open: bool = False
     """Whether to open the recording in the rerun viewer."""
     movie: Path | None = None
-    """A .gif or .mp4 file to write instead of a recording."""
+    """A .gif file to write instead of a recording."""
 
     def check(self):
-        if self.movie and self.movie.suffix not in movie.WRITERS:
+        if self.movie and self.movie.suffix != ".gif":
             found = self.movie.suffix or "none"
-            raise ValueError(f"movie: expected the ending .gif or .mp4, found {found}")
+            raise ValueError(f"movie: expected the ending .gif, found {found}")
         if self.movie and (self.output or self.open):
             raise ValueError("movie: is written instead of a recording, leave out output and open")
 
@@ -61,7 +61,10 @@ def run(name: str, words: Sequence[str]) -> None:
         print(f"the picture is {maps.draw(command.source, command.output)}")
         return
     path = command.movie or command.output or _beside(command)
-    write = _writer(command, path)
+    write = movie.write
+    if not command.movie:
+        with needs("rerun-sdk", "view", path):
+            from vertiwm_jax.viewing.recording import write
     scene = _scene(command)
     print(scene.title, flush=True)
     write(scene, path)
@@ -82,21 +85,6 @@ def _beside(command: View) -> Path:
         task = f"{command.suite or 'held-out'}-{command.task or 0}"
         return source / f"{task}-{command.model}.rrd"
     return source.with_name(f"{source.stem}-drive-{command.drive or 0}.rrd")
-
-
-def _writer(command: View, path: Path) -> Callable[[Scene, Path], None]:
-    """What writes the file; `ConfigError`, which names it, without the package for that."""
-    if command.movie:
-        movie.check(path)
-        return movie.write
-    try:
-        from vertiwm_jax.viewing.recording import write
-    except ImportError as error:
-        raise ConfigError(
-            f"{path}: expected the package rerun-sdk to write it, found: {error}; "
-            'pip install "vertiwm-jax[view]"'
-        ) from None
-    return write
 
 
 def _scene(command: View) -> Scene:

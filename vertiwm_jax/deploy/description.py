@@ -9,68 +9,63 @@ import numpy as np
 
 import vertiwm_jax
 from vertiwm_jax.env import observation
-from vertiwm_jax.env.controllers import REFERENCE, LookAhead, StraightToGoal
-from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, ObservationSpec, Part
-from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, ObservationSpec
 from vertiwm_jax.env.traversability import TraversabilityCost
-from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.networks.policy import TanhNormalActor
 from vertiwm_jax.rl import running_statistics
-from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy
+from vertiwm_jax.rl.policy import Policy
 from vertiwm_jax.state import STEP_SECONDS, Command
 from vertiwm_jax.terrain.classes import STANDARD
 
 _SIZES = "length", "width", "wheelbase", "track", "ride_height", "steering_limit"
-_BASES = {LookAhead: "look ahead", StraightToGoal: REFERENCE}
 
 
-def about(
-    policy: ResidualPolicy | DeterministicPolicy,
-    config: NavigationConfig,
-    vehicle: Vehicle,
-    held: int,
-) -> dict[str, Any]:
-    """What the numbers of a policy mean, for JSON.
-
-    config: of the environment; vehicle: what drives; held: steps for which its
-    actions were held while it learned.
-    """
+def about(policy: Policy) -> dict[str, Any]:
+    """What the numbers of a policy mean, for JSON."""
+    vehicle, speed_range = policy.config.vehicle.vehicle, policy.task.speed_range
     places, heading = observation.poses_ahead(vehicle)
     still = Command(jnp.float32(0), jnp.float32(0))
-    base = policy.base if isinstance(policy, ResidualPolicy) else None
-    image = _learned(policy).actor.layout.image
+    image = policy.learned.actor.layout.image
     seen = ObservationSpec(image=image is not None)
+    parts = {
+        name: {
+            "slice": [part.where.start, part.where.stop, part.where.step or 1],
+            "unit": part.unit,
+            "scale": part.scale,
+        }
+        for name, part in seen.parts.items()
+    }
     return {
         "vertiwm_jax": vertiwm_jax.__version__,
         "step_seconds": STEP_SECONDS,
-        "held_while_learning": held,
+        "held_while_learning": policy.config.action_repeat,
         "observation": {
             "size": seen.size,
             "limit": observation.OBSERVATION_LIMIT,
-            "parts": {name: _part(part) for name, part in seen.parts.items()},
+            "parts": parts,
             "places": np.column_stack([places, heading]).tolist(),
             "class_places": observation.CLASS_PLACES.tolist(),
         },
         "action": {
-            "speed_range": config.speed_range,
+            "speed_range": speed_range,
             "steering_limit": float(vehicle.steering_limit),
-            "standing": vehicle.action(still, config.speed_range).tolist(),
+            "standing": vehicle.action(still, speed_range).tolist(),
         },
         "arcs": {"steering": ARC_STEERING.tolist(), "stations": ARC_STATIONS.tolist()},
         "network": {
             "normalised_limit": running_statistics.CLIP,
             "embedding": image,
-            "squashed": isinstance(_learned(policy).actor, TanhNormalActor),
+            "squashed": isinstance(policy.learned.actor, TanhNormalActor),
         },
-        "base": None if base is None else {"name": _BASES[type(base)], **_numbers(base)},
+        "base": policy.base and {"name": policy.config.base, **_numbers(policy.base)},
         "vehicle": {name: float(getattr(vehicle, name)) for name in _SIZES},
         "ground_classes": STANDARD.names,
     }
 
 
-def weights(policy: ResidualPolicy | DeterministicPolicy) -> dict[str, np.ndarray]:
+def weights(policy: Policy) -> dict[str, np.ndarray]:
     """Weights of the actor, by layer, and `mean` and `std` `[O]` of observations; float32."""
-    learned = _learned(policy)
+    learned = policy.learned
     leaves = jax.tree.leaves_with_path(learned.params["params"])
     named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
     named.pop("log_std", None)  # which only exploration needs
@@ -78,21 +73,11 @@ def weights(policy: ResidualPolicy | DeterministicPolicy) -> dict[str, np.ndarra
     return {name: np.asarray(leaf, np.float32) for name, leaf in named.items()}
 
 
-def _learned(policy: ResidualPolicy | DeterministicPolicy) -> DeterministicPolicy:
-    return policy.correction if isinstance(policy, ResidualPolicy) else policy
-
-
-def _part(part: Part) -> dict[str, Any]:
-    where = [part.where.start, part.where.stop, part.where.step or 1]
-    return {"slice": where, "unit": part.unit, "scale": part.scale}
-
-
 def _numbers(base: Any) -> dict[str, Any]:
-    """The settings of a controller, but for the environment's."""
+    """The settings of a controller, but for those of environment and vehicle."""
     own = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
-    del own["config"]
-    own.pop("steering_limit", None)  # that of the vehicle
     return {
         name: dataclasses.asdict(value) if isinstance(value, TraversabilityCost) else value
         for name, value in own.items()
+        if name not in ("config", "steering_limit")
     }

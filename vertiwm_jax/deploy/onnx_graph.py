@@ -131,20 +131,8 @@ def _as_float(x: Any) -> Any:
     return x if isinstance(x, Recorded) else np.asarray(x, np.float32)
 
 
-def _clip(x: Recorded, low: float, high: float) -> Recorded:
-    return x.graph.add("Clip", x, low, high)
-
-
-def _concatenate(arrays: Sequence[Recorded], axis: int) -> Recorded:
-    return arrays[0].graph.add("Concat", *arrays, axis=axis)
-
-
 def _max(x: Recorded, axis: int, keepdims: bool = False) -> Recorded:
     return x.graph.add("ReduceMax", x, axes=[axis], keepdims=int(keepdims))
-
-
-def _reshape(x: Recorded, shape: tuple[int, ...]) -> Recorded:
-    return x.graph.add("Reshape", x, np.array(shape))
 
 
 def _sum(x: Recorded, axis: int, keepdims: bool = False) -> Recorded:
@@ -152,9 +140,9 @@ def _sum(x: Recorded, axis: int, keepdims: bool = False) -> Recorded:
 
 
 _FUNCTIONS: dict[Callable, Callable[..., Recorded]] = {
-    np.clip: _clip,
-    np.concatenate: _concatenate,
+    np.clip: lambda x, low, high: x.graph.add("Clip", x, low, high),
+    np.concatenate: lambda arrays, axis: arrays[0].graph.add("Concat", *arrays, axis=axis),
     np.max: _max,
-    np.reshape: _reshape,
+    np.reshape: lambda x, shape: x.graph.add("Reshape", x, np.array(shape)),
     np.sum: _sum,
 }

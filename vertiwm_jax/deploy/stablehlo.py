@@ -24,7 +24,8 @@ PLATFORMS = ("cpu", "cuda")
 def policy(act: Callable[[jax.Array], jax.Array], size: int) -> bytes:
     """`act`, `[B, size]` float32 observations to `[B, 2]` actions, for any B."""
     (batch,) = export.symbolic_shape("batch")
-    return _serialised(act, _floats(batch, size))
+    # A function, since a policy is a pytree, which cannot be hashed.
+    return _serialised(lambda seen: act(seen), _floats(batch, size))
 
 
 def route(config: NavigationConfig, vehicle: Vehicle) -> bytes:

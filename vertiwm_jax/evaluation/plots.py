@@ -27,7 +27,6 @@ def panels(
     x_label: str,
     y_label: str = "",
     columns: int = 4,
-    size: tuple[float, float] = (3.2, 2.7),
     first: int = 0,
     sharey: bool = False,
     line_style: Mapping[str, Any] | None = None,
@@ -39,7 +38,6 @@ def panels(
         shown: the lines of each panel, by the panel's title.
         x_label, y_label: of all panels.
         columns: panels side by side.
-        size: of a panel, inches.
         first: style of the first line, see `figures.line`.
         sharey: whether all panels have the same y axis.
         line_style: options of `Axes.plot`.
@@ -51,7 +49,7 @@ def panels(
     columns = min(columns, len(shown))
     rows = math.ceil(len(shown) / columns)
     with figures.style():
-        figure = figures.sheet(size[0] * columns, size[1] * rows + 0.3)
+        figure = figures.sheet(3.2 * columns, 2.7 * rows + 0.3)
         grid = figure.subplots(rows, columns, squeeze=False, sharey=sharey)
         for axes, (title, lines) in zip(grid.flat, shown.items(), strict=False):
             for i, (name, (x, y)) in enumerate(lines.items(), first):

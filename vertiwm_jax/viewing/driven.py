@@ -15,6 +15,7 @@ from vertiwm_jax.env.suites import Suite
 from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation.prediction import modeled_wheels
+from vertiwm_jax.evaluation.report import NavigationTest
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.state import STEP_SECONDS
@@ -44,14 +45,9 @@ def load(
     Raises:
         ConfigError: there is no such task or policy.
     """
-    config = replace(experiment.load(run / "config.yaml"), planning=None)
-    if suite:
-        config = replace(config, terrain=None)
-        config = replace(config, ground=replace(config.ground, suites=(suite,)))
-    if weights:
-        config = replace(config, weights=weights)
-    if vehicle is not None:
-        config = replace(config, vehicle=vehicle)
+    asked = NavigationTest(run, vehicle=vehicle, suites=(suite,) if suite else (), planning=False)
+    config = asked.changed(experiment.load(run / "config.yaml"))
+    config = replace(config, weights=weights or config.weights)
     terrain = experiment.held_out(config)
     policies = experiment.learned(config, run)
     pool = suites.test_tasks(config.ground, terrain)

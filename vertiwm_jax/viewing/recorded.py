@@ -11,7 +11,6 @@ from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.learning.schema import DataError
-from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.viewing.scene import Prediction, Scene
 
 STEPS = 16
@@ -34,24 +33,19 @@ def load(path: Path, drive: int, name: str, dynamics: Dynamics, params: Params) 
             f"{path}: drive {drive}: expected at least {2 * STEPS} steps, found {length}"
         )
     alone: Drives = jax.tree.map(lambda x: np.asarray(x)[drive : drive + 1], drives)
+    test = TestWindows.of(alone, terrain, STEPS, STEPS, STEPS)
+    states, read = prediction.predict(dynamics, params, test)
+    first = np.asarray(test.windows.state)[:, STEPS]
     return Scene(
         title=f"{path.stem}, drive {drive}, and {name}",
         terrain=terrain,
         state=np.asarray(alone.state)[0, : length + 1],
         command=np.asarray(alone.control)[0, :length],
         wheels=jax.tree.map(lambda x: x[0, : length + 1], alone.wheels),
-        prediction=predict(dynamics, params, terrain, alone),
-    )
-
-
-def predict(dynamics: Dynamics, params: Params, terrain: TerrainMap, drive: Drives) -> Prediction:
-    """What the model predicts every 16 steps of one drive, D = 1, of 32 steps or more."""
-    test = TestWindows.of(drive, terrain, STEPS, STEPS, STEPS)
-    states, read = prediction.predict(dynamics, params, test)
-    first = np.asarray(test.windows.state)[:, STEPS]
-    return Prediction(
-        start=STEPS * (1 + np.arange(len(test))),
-        state=np.concatenate([first[:, None], states.vector], axis=1),
-        coefficients=read.coefficients,
-        sinkage=read.wheels and np.asarray(read.wheels.wheel_sinkage),
+        prediction=Prediction(
+            start=STEPS * (1 + np.arange(len(test))),
+            state=np.concatenate([first[:, None], states.vector], axis=1),
+            coefficients=read.coefficients,
+            sinkage=read.wheels and np.asarray(read.wheels.wheel_sinkage),
+        ),
     )

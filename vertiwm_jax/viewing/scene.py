@@ -39,11 +39,6 @@ class Prediction:
             found[start + 1 : start + 1 + len(part)] = part
         return found
 
-    @property
-    def states(self) -> np.ndarray:
-        """`[N, H, 12]` the predicted states, without the recorded first ones."""
-        return self.state[:, 1:]
-
 
 @dataclass(frozen=True)
 class Scene:
@@ -120,7 +115,7 @@ def panels(scene: Scene) -> Panels:
     if depth is not None:
         shown["wheel sinkage [mm]"] = _sinkage(np.asarray(depth))
     if prediction:
-        states = prediction.along(prediction.states, scene.steps)
+        states = prediction.along(prediction.state[:, 1:], scene.steps)
         for name, row in (("roll", 3), ("pitch", 4)):
             shown[TILT][f"{name}, predicted"] = np.degrees(states[:, row])
         shown["speed [m/s]"]["predicted"] = states[:, 6]
@@ -137,5 +132,5 @@ def panels(scene: Scene) -> Panels:
 
 
 def _sinkage(depth: np.ndarray) -> dict[str, np.ndarray]:
-    # A recorded wheel that is in the air is above the ground, a modelled one has not sunk.
+    # Recorded sinkage of a wheel in the air is negative, predicted sinkage is 0.
     return dict(zip(WHEELS, 1000 * np.maximum(depth, 0.0).T, strict=True))
