@@ -12,8 +12,8 @@ from typing import Any
 import benchmarks
 from benchmarks._harness import cell
 
-_APART = {"gpu", "recurrent_baseline", "turns"}
-"""Those that need a GPU, or a folder of drives, and train; and what runs another one."""
+_APART = {"gpu", "recurrent_baseline", "soil_adaptation", "turns"}
+"""Those that need a GPU or a folder of drives; and what runs another one."""
 _NEEDS = {
     "chrono": ("pychrono", "see docs/collect.md"),
     "torch_peer": ("torch", 'pip install -e ".[peers]"'),

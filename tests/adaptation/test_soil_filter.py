@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from jax.scipy.special import logit
 
+from benchmarks.soil_adaptation import mistaken
 from vertiwm_jax.adaptation import soil_filter
 from vertiwm_jax.adaptation.soil_filter import SoilFilter, believed
-from vertiwm_jax.evaluation.adaptation import mistaken
 from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
 from vertiwm_jax.mechanics.kinematic import bicycle_of, place
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like, stiffened

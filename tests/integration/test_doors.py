@@ -383,14 +383,7 @@ def test_bad_drives_are_named(tmp_path, capsys):
     (tmp_path / "maps" / "map_0.npz").unlink()
     drives(tmp_path, count=25, steps=24, speed=4.0, with_map=False)
     assert "map_0.npz was expected" in refusal(door("evaluate"), *predict)
-    drives(tmp_path, count=25, steps=40, speed=4.0)
-    adapt = ("adaptation", "--data", tmp_path)
-    assert "32 steps on soil alone, found none" in refusal(door("evaluate"), *adapt)
     capsys.readouterr()
-    with pytest.raises(SystemExit) as stop:
-        door("evaluate")(["adaptation", "--data", ".", "--wrong", "moon"])
-    assert stop.value.code == 2
-    assert "wrong: expected one of mud, sand" in capsys.readouterr().err
     for argv in (["prediction"], ["predict"], ["prediction", "--data", ".", "--stride", "0"]):
         with pytest.raises(SystemExit) as stop:
             door("evaluate")(argv)

@@ -1,17 +1,15 @@
-"""`vertiwm evaluate`: how well a model predicts and adapts, and a policy drives."""
+"""`vertiwm evaluate`: how well a model predicts, and a policy drives."""
 
 from collections.abc import Sequence
 
 import tyro
 
-from vertiwm_jax.evaluation.adaptation import AdaptationTest
 from vertiwm_jax.evaluation.calibration import CalibrationTest
 from vertiwm_jax.evaluation.prediction_report import PredictionTest
 from vertiwm_jax.evaluation.report import NavigationTest
 
 TESTS = {
     "prediction": PredictionTest,
-    "adaptation": AdaptationTest,
     "calibration": CalibrationTest,
     "navigation": NavigationTest,
 }

@@ -40,7 +40,7 @@ def export(run: Path, output: Path | None = None, seed: int = 0) -> Path:
 def files(policy: Policy) -> dict[str, bytes | str]:
     """What the exported folder of a policy holds, by file name; `UserError` without `onnx`."""
     with needs("onnx", "export", "policy.onnx"):
-        from vertiwm_jax.deploy import onnx_graph
+        from vertiwm_jax.deploy.onnx_graph import record
     about = description.about(policy)
     weights: dict[str, Any] = dict(description.weights(policy))
     arrays = io.BytesIO()
@@ -51,7 +51,7 @@ def files(policy: Policy) -> dict[str, bytes | str]:
     return {
         "policy.json": json.dumps(about, indent=1) + "\n",
         "policy.npz": arrays.getvalue(),
-        "policy.onnx": onnx_graph.record(partial(run_policy.act, about, weights), size, 2),
+        "policy.onnx": record(partial(run_policy.act, about, weights), size, 2),
         "policy.stablehlo": stablehlo.policy(policy, size),
         "route.stablehlo": stablehlo.route(task, vehicle),
         "observe.stablehlo": stablehlo.observe(task, vehicle, encoders),

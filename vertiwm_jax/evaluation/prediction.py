@@ -19,7 +19,6 @@ from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.mechanics.simulator import SimulatorHistory
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.terrain.soil import Soil
 from vertiwm_jax.world_model.alone import AloneHistory
 from vertiwm_jax.world_model.nesam import NesamHistory
 from vertiwm_jax.world_model.verti_wm import VertiWMHistory
@@ -43,7 +42,6 @@ class TestWindows:
 
     drive: `[N]` index of the drive that each is from. Windows of a drive are much alike, so
         intervals are drawn over drives.
-    groups: names of the groups that errors are averaged over; `windows.ground` has their indices.
     """
 
     __test__ = False  # the name starts as pytest's classes do
@@ -51,7 +49,6 @@ class TestWindows:
     windows: Windows
     drive: np.ndarray
     terrain: TerrainMap
-    groups: tuple[str, ...] = GROUNDS
 
     @classmethod
     def of(
@@ -79,13 +76,11 @@ class Interval:
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """Errors of one model after so many steps, the horizon, by group of windows.
+    """Errors of one model after so many steps, the horizon.
 
-    By default, windows are grouped by the kind of ground.
-
-    final: by measure and then by group, mean absolute error after the last step.
-    growth: by group, mean position error after each step, m.
-    count: by group, windows.
+    final: by measure and then by kind of ground, mean absolute error after the last step.
+    growth: by kind of ground, mean position error after each step, m.
+    count: by kind of ground, windows.
     diverged: windows whose prediction is not finite; they enter as if the model had not moved.
     """
 
@@ -135,33 +130,24 @@ class Predicted(NamedTuple):
     read: Reading
 
 
-def predict(
-    dynamics: Dynamics, params: Params, test: TestWindows, soils: Soil | None = None
-) -> Predicted:
+def predict(dynamics: Dynamics, params: Params, test: TestWindows) -> Predicted:
     """Predicts every window open-loop; the results are in host memory.
 
     The history is warmed up on the recorded context. From its last state on, the model sees its own
     predictions and the recorded commands (the paper's protocol, Sec. V-A).
-
-    Args:
-        dynamics, params: the model.
-        test: N windows.
-        soils: leaves `[N, K]`, soils of the K classes in each window; by default those of the map.
     """
-    return jax.device_get(_predict(dynamics, params, test.terrain, test.windows, soils))
+    return jax.device_get(_predict(dynamics, params, test.terrain, test.windows))
 
 
 @partial(jax.jit, static_argnames="dynamics")
 def _predict(
-    dynamics: Dynamics, params: Params, terrain: TerrainMap, windows: Windows, soils: Soil | None
+    dynamics: Dynamics, params: Params, terrain: TerrainMap, windows: Windows
 ) -> Predicted:
-    def one(inputs: tuple[Windows, Soil | None]) -> Predicted:
-        window, soil = inputs
+    def one(window: Windows) -> Predicted:
         ground = terrain.select(window.world)
-        ground = ground if soil is None else ground.with_soils(soil)
         return Predicted(*open_loop(dynamics, params, ground, window, Reading.of))
 
-    return jax.lax.map(one, (windows, soils), batch_size=BATCH)
+    return jax.lax.map(one, windows, batch_size=BATCH)
 
 
 def absolute_errors(
@@ -187,18 +173,18 @@ def absolute_errors(
 
 
 def evaluate(name: str, dynamics: Dynamics, params: Params, test: TestWindows) -> PredictionErrors:
-    """Errors of a model after the last step of every window, by group."""
+    """Errors of a model after the last step of every window, by kind of ground."""
     return summary(name, predict(dynamics, params, test).states, test)
 
 
 def summary(
     name: str, predicted: VehicleState, test: TestWindows, horizon: int | None = None
 ) -> PredictionErrors:
-    """Errors of predictions after `horizon` steps, by default all of them, by group."""
+    """Errors of predictions after `horizon` steps, by default all of them, by kind of ground."""
     errors, lost = absolute_errors(predicted, test)
     horizon = int(horizon or errors["position"].shape[1])
-    group = np.asarray(test.windows.ground)
-    members = {test.groups[i]: group == i for i in np.unique(group).tolist()}
+    ground = np.asarray(test.windows.ground)
+    members = {kind: ground == i for i, kind in enumerate(GROUNDS) if (ground == i).any()}
     final = {
         measure: {
             kind: bootstrap(error[rows, horizon - 1], test.drive[rows])
@@ -245,31 +231,31 @@ def prediction_errors(
 
 
 def format_table(models: Sequence[PredictionErrors], measure: str) -> str:
-    """A Markdown table of one measure, one model a row, one group of windows a column."""
+    """A Markdown table of one measure, one model a row, one kind of ground a column."""
     rows = []
     for model in models:
         found = model.final[measure].items()
-        cells = {f"{group} (n = {model.count[group]})": str(error) for group, error in found}
+        cells = {f"{kind} (n = {model.count[kind]})": str(error) for kind, error in found}
         rows.append({"model": model.name, **cells, "diverged": model.diverged})
     title = f"{models[0].horizon}-step {measure} error, {MEASURES[measure]}"
     return f"{title}: mean and 95 % interval over drives\n\n{markdown(rows)}"
 
 
 def csv_rows(models: Sequence[PredictionErrors]) -> list[Row]:
-    """A row for each model, measure and group of windows."""
+    """A row for each model, measure and kind of ground."""
     return [
         {
             "model": model.name,
             "steps": model.horizon,
             "measure": measure,
             "unit": MEASURES[measure],
-            "ground": group,
-            "windows": model.count[group],
+            "ground": kind,
+            "windows": model.count[kind],
             **vars(error),
         }
         for model in models
-        for measure, by_group in model.final.items()
-        for group, error in by_group.items()
+        for measure, by_kind in model.final.items()
+        for kind, error in by_kind.items()
     ]
 
 

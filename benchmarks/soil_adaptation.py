@@ -1,28 +1,28 @@
-"""How much estimating soils while driving helps, where the map has them wrong."""
+"""How much estimating soils while driving helps predictions, where the map has all soils wrong.
 
-from dataclasses import replace
+Position errors after 16 steps on soil, m, with the soils of the map, with wrong ones, and with
+those that the filter believes in when the prediction begins: mean and 95 % interval over drives, by
+how long the drive has lasted then.
+"""
+
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks._harness import parser, report
 from vertiwm_jax.adaptation.soil_filter import SoilBelief, SoilFilter, believed
-from vertiwm_jax.config import Count, settings
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.evaluation.prediction import (
-    PredictionErrors,
-    TestWindows,
-    format_table,
-    predict,
-    summary,
-)
+from vertiwm_jax.evaluation.prediction import BATCH, bootstrap
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning import windows as recorded
-from vertiwm_jax.learning.dataset import Drives
+from vertiwm_jax.learning.dataset import SPLITS, Drives
+from vertiwm_jax.learning.objectives import open_loop
 from vertiwm_jax.learning.schema import DataError
-from vertiwm_jax.learning.windows import GROUNDS, WindowIndex
+from vertiwm_jax.learning.windows import GROUNDS, WindowIndex, Windows
 from vertiwm_jax.models.registry import ModelName, load_model
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query
@@ -32,43 +32,6 @@ from vertiwm_jax.terrain.soil import PRESETS, Soil
 CONTEXT = HORIZON = STRIDE = 16
 PERIODS = {"0 to 5 s": 0.0, "5 to 10 s": 5.0, "after 10 s": 10.0}
 """Parts of a drive between which errors are told apart, and the seconds when they begin."""
-
-
-@settings
-class AdaptationTest:
-    """Open-loop position errors where the map has soils wrong, and how they are adapted to."""
-
-    data: Path
-    """Folder of `.npz` files of drives, with the maps they name."""
-    model: ModelName = "nesam"
-    """The model that adapts."""
-    weights: Path | None = None
-    """Folder of a fitted model, instead of the one that comes with the package."""
-    wrong: str = "snow"
-    """What the map is made to say of all soil: a name of `terrain.soil.PRESETS`."""
-    split: dataset.Split = "test"
-    """Which of the drives."""
-    every: Count = 1
-    """Of how many drives one is used."""
-    filter: SoilFilter = SoilFilter()
-    """How soils are estimated."""
-
-    def check(self):
-        if self.wrong not in PRESETS:
-            raise ValueError(f"wrong: expected one of {', '.join(PRESETS)}, found {self.wrong!r}")
-
-    def run(self) -> str:
-        """Runs the test; returns its table as Markdown."""
-        drives, terrain = dataset.load_drives(self.data, self.split)
-        drives = jax.tree.map(lambda x: x[:: self.every], drives)
-        index = windows_on_soil(drives, terrain)
-        model, params = load_model(self.model, self.weights, soil="map", exact_gradient=True)
-        wrong = mistaken(terrain, PRESETS[self.wrong])
-        beliefs = adapt(self.filter, model, params, wrong, drives)
-        errors = compare(model, params, terrain, wrong, drives, index, beliefs)
-        accepted, refused = (int(x[:, -1].sum()) for x in (beliefs.accepted, beliefs.refused))
-        counts = f"Measurements of soils: {accepted} accepted, {refused} refused"
-        return f"{format_table(errors, 'position')}\n\n{counts}"
 
 
 def mistaken(terrain: TerrainMap, soil: Soil) -> TerrainMap:
@@ -143,16 +106,13 @@ def compare(
     drives: Drives,
     index: WindowIndex,
     beliefs: SoilBelief,
-) -> list[PredictionErrors]:
-    """Errors with the true soils, with the wrong ones, and with those believed, of `adapt`.
+) -> dict[str, np.ndarray]:
+    """`[N]` m, position errors with the true soils, with the wrong ones, and with those of `adapt`.
 
-    A window is predicted with what was believed when the prediction begins. Windows are grouped by
-    the period of the drive in which that is.
+    A window is predicted with what was believed when the prediction begins; one whose prediction is
+    not finite counts as not having moved.
     """
     drive, begin = np.asarray(index.drive), np.asarray(index.start) + CONTEXT
-    period = np.digitize(begin * STEP_SECONDS, list(PERIODS.values())) - 1
-    windows = recorded.gather(drives, replace(index, ground=jnp.asarray(period)))
-    test = TestWindows(windows, drive, terrain, tuple(PERIODS))
 
     def everywhere(soils: Soil) -> Soil:
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (len(drive), *x.shape)), soils)
@@ -163,8 +123,63 @@ def compare(
     latest = jax.tree.map(lambda x: x[drive, np.maximum(block, 0)], beliefs)
     adapted = jax.vmap(lambda belief: query.soils(believed(wrong, belief)))(latest)
     adapted = jax.tree.map(lambda x, y: jnp.where((block >= 0)[:, None], x, y), adapted, of_wrong)
-    rows = {"true soils": of_map, "wrong soils": of_wrong, "wrong soils, adapted": adapted}
-    return [
-        summary(name, predict(model, params, test, soils).states, test)
+    rows = {"true": of_map, "wrong": of_wrong, "wrong, adapted": adapted}
+    windows = recorded.gather(drives, index)
+    return {
+        name: np.asarray(_errors(model, params, terrain, windows, soils))
         for name, soils in rows.items()
-    ]
+    }
+
+
+@partial(jax.jit, static_argnames="model")
+def _errors(
+    model: Dynamics, params: Params, terrain: TerrainMap, windows: Windows, soils: Soil
+) -> jax.Array:
+    """`[N]` m after the last step; soils: leaves `[N, K]`."""
+
+    def one(inputs: tuple[Windows, Soil]) -> jax.Array:
+        window, soils = inputs
+        ground = terrain.select(window.world).with_soils(soils)
+        final = open_loop(model, params, ground, window, lambda _: None)[0].position[-1]
+        final = jnp.where(jnp.isfinite(final).all(), final, window.state[window.context, :3])
+        return jnp.linalg.norm(final - window.state[-1, :3])
+
+    return jax.lax.map(one, (windows, soils), batch_size=BATCH)
+
+
+def periods(index: WindowIndex) -> dict[str, np.ndarray]:
+    """By period of a drive, `[N]` bool, whether the prediction of a window begins in it."""
+    begin = (np.asarray(index.start) + CONTEXT) * STEP_SECONDS
+    found = np.digitize(begin, list(PERIODS.values())) - 1
+    return {name: found == i for i, name in enumerate(PERIODS) if (found == i).any()}
+
+
+def main() -> None:
+    arguments = parser(__doc__)
+    arguments.add_argument("--data", type=Path, required=True, help="folder of drives")
+    arguments.add_argument("--model", choices=get_args(ModelName), default="nesam")
+    arguments.add_argument("--weights", type=Path, help="folder of a fitted model")
+    arguments.add_argument("--wrong", choices=PRESETS, default="snow", help="what all soil is said")
+    arguments.add_argument("--split", choices=SPLITS, default="test", help="which of the drives")
+    arguments.add_argument("--every", type=int, default=1, help="of how many drives one is used")
+    chosen = arguments.parse_args()
+    drives, terrain = dataset.load_drives(chosen.data, chosen.split)
+    drives = jax.tree.map(lambda x: x[:: chosen.every], drives)
+    index = windows_on_soil(drives, terrain)
+    model, params = load_model(chosen.model, chosen.weights, soil="map", exact_gradient=True)
+    wrong = mistaken(terrain, PRESETS[chosen.wrong])
+    beliefs = adapt(SoilFilter(), model, params, wrong, drives)
+    errors = compare(model, params, terrain, wrong, drives, index, beliefs)
+    results: dict[str, dict[str, str | int]] = {
+        f"{name} soils": {
+            f"{when} (n = {here.sum()})": str(bootstrap(error[here], np.asarray(index.drive)[here]))
+            for when, here in periods(index).items()
+        }
+        for name, error in errors.items()
+    }
+    counts = {name: int(getattr(beliefs, name)[:, -1].sum()) for name in ("accepted", "refused")}
+    report("soil_adaptation", results | {"measurements": counts}, chosen.json)
+
+
+if __name__ == "__main__":
+    main()

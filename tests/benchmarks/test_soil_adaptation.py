@@ -1,10 +1,12 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 
+from benchmarks import soil_adaptation
 from vertiwm_jax.adaptation.soil_filter import SoilFilter
-from vertiwm_jax.evaluation import adaptation
 from vertiwm_jax.learning.dataset import Drives, WheelSignals
+from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import PRESETS, to_unit
@@ -41,26 +43,35 @@ def driven() -> Drives:
 
 def test_predictions_get_better_as_the_drive_goes_on():
     drives = driven()
-    wrong = adaptation.mistaken(TERRAIN, PRESETS["snow"])
-    beliefs = adaptation.adapt(SoilFilter(memory=1.0), Slowed(), None, wrong, drives)
+    wrong = soil_adaptation.mistaken(TERRAIN, PRESETS["snow"])
+    beliefs = soil_adaptation.adapt(SoilFilter(memory=1.0), Slowed(), None, wrong, drives)
     # Blocks of eight steps, of which the first has no history; none after the end of a drive.
     np.testing.assert_array_equal(beliefs.accepted[0, :, MUD], np.arange(10))
     np.testing.assert_array_equal(beliefs.accepted[1, :, MUD], np.minimum(np.arange(10), 5))
-    index = adaptation.windows_on_soil(drives, TERRAIN)
-    found = adaptation.compare(Slowed(), None, TERRAIN, wrong, drives, index, beliefs)
-    means = {row.name: [x.mean for x in row.final["position"].values()] for row in found}
+    index = soil_adaptation.windows_on_soil(drives, TERRAIN)
+    found = soil_adaptation.compare(Slowed(), None, TERRAIN, wrong, drives, index, beliefs)
+    parts = soil_adaptation.periods(index)
+    means = {name: [x[here].mean() for here in parts.values()] for name, x in found.items()}
     shares = [float(to_unit(PRESETS[name])[1]) for name in ("mud", "snow")]
     missed = 1.6 * 2.0 * (shares[0] - shares[1])
-    assert found[0].count == {"0 to 5 s": 5, "5 to 10 s": 1}
-    np.testing.assert_allclose(means["true soils"], 0, atol=1e-5)
-    np.testing.assert_allclose(means["wrong soils"], missed, rtol=1e-3)
-    assert means["wrong soils, adapted"][0] < 0.2 * missed
-    assert means["wrong soils, adapted"][1] < 0.05 * missed
+    assert {name: here.sum() for name, here in parts.items()} == {"0 to 5 s": 5, "5 to 10 s": 1}
+    np.testing.assert_allclose(means["true"], 0, atol=1e-5)
+    np.testing.assert_allclose(means["wrong"], missed, rtol=1e-3)
+    assert means["wrong, adapted"][0] < 0.2 * missed
+    assert means["wrong, adapted"][1] < 0.05 * missed
 
 
 def test_wrong_soils_are_those_of_soft_ground_alone():
-    wrong = adaptation.mistaken(TERRAIN, PRESETS["snow"])
+    wrong = soil_adaptation.mistaken(TERRAIN, PRESETS["snow"])
     soft = np.asarray(TERRAIN.deformable)
     assert (np.asarray(wrong.soils.kphi)[0, soft] == PRESETS["snow"].kphi).all()
     same = np.asarray(wrong.soils.kphi == TERRAIN.soils.kphi)[0]
     assert same[~soft].all()
+
+
+def test_drives_without_soil_are_refused():
+    grass = TerrainMap.from_array(np.full((65, 65), 4.0), np.full((8, 8), 3))
+    drives = driven()
+    drives = replace(drives, wheel_class=np.full_like(drives.wheel_class, 3))
+    with pytest.raises(DataError, match="32 steps on soil alone, found none"):
+        soil_adaptation.windows_on_soil(drives, grass)
