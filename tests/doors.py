@@ -1,5 +1,6 @@
 """What tests of commands share."""
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -58,6 +59,11 @@ def refusal(door: Door, *argv: object) -> str:
     message = stop.value.code
     assert isinstance(message, str) and message.startswith("error: ") and "\n" not in message
     return message
+
+
+def squeezed(table: str) -> str:
+    """A table without the spaces that align its columns."""
+    return re.sub(" +", " ", table)
 
 
 def exportable(learned: DeterministicPolicy, base: Base, task: NavigationConfig) -> Policy:

@@ -29,7 +29,7 @@ def test_trajectories_show_every_drive():
         name: (t * [60.0, y, 0.0], 0.2 * np.sin(9 * t) * [1.0, 0.5, 0.0])
         for name, y in (("learned", 30.0), ("straight to goal", 0.0))
     }
-    figure = plots.trajectories(ground(hills()), 0, drives, np.array([60.0, 0.0]), 8.0, 0.1)
+    figure = plots.trajectories(ground(hills()), 0, drives, np.array([60.0, 0.0]), 8.0)
     overhead, roll, pitch = figure.axes
     lines = {line.get_label(): line.get_xydata() for line in overhead.lines}
     np.testing.assert_allclose(lines["learned"], drives["learned"][0][:, :2])

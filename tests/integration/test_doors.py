@@ -349,7 +349,7 @@ def test_predictions_of_drives(tmp_path, capsys):
     out = tmp_path / "tables"
     argv = ["prediction", "--data", str(tmp_path), "--context", "2", "--horizon", "4"]
     door("evaluate")([*argv, "--models", "builtin", "--output", str(out)])
-    assert "| constant velocity | 0.000 (0.000-0.000) | 0 |" in capsys.readouterr().out
+    assert "| constant velocity | 0.000 (0.000-0.000) | 0 " in capsys.readouterr().out
     with (out / "prediction.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["measure"] == "position"]
     assert [row["model"] for row in rows] == ["builtin", "kinematic bicycle", "constant velocity"]

@@ -194,9 +194,7 @@ def test_one_specialist_alone_is_fitted_and_compared(fitted, folder, tmp_path, c
     command = ["prediction", "--data", str(folder / "drives" / "deformable")]
     command += ["--context", "2", "--horizon", "3", "--stride", "50", "--models", "builtin"]
     door("evaluate")([*command, "--compare", str(run)])
-    printed = capsys.readouterr().out
-    assert "| no_terrain: transformer | " in printed
-    assert "the paper, 16 steps: deformable" in printed and "| 0.790 |" in printed
+    assert f"| {run.name}: transformer " in capsys.readouterr().out
     with pytest.raises(CheckpointError, match="expected vertiwm, found transformer alone"):
         load_model("vertiwm", run / "model")
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from doors import door, refusal
+from doors import door, refusal, squeezed
 from learning import recordings
 
 from vertiwm_jax.learning import dataset, schema

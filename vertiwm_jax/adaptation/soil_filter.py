@@ -24,6 +24,7 @@ from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.nesam import Nesam
 
 T = TypeVar("T")
+Six = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
 MARGIN = 0.05
 """Share of `BOUNDS` from either end within which the filter starts: beyond, nothing would move."""
 LONGEST_STEP = 1.0
@@ -67,14 +68,7 @@ class SoilFilter:
     memory: Annotated[float, Bounds("more than 0 and at most 1", lambda x: 0 < x <= 1)] = 0.98
     """Share of a deviation from the map that a measurement leaves to the next one; the rest is
     forgotten, and what is known grows uncertain in step."""
-    noise: tuple[Positive, Positive, Positive, Positive, Positive, Positive] = (
-        0.05,
-        0.05,
-        0.02,
-        0.02,
-        0.02,
-        0.02,
-    )
+    noise: Six = (0.05, 0.05, 0.02, 0.02, 0.02, 0.02)
     """Standard deviations of what the model misses in H steps with the right soil: ahead, to the
     left and up, m, and about these axes, rad."""
     gate: Positive = 22.5

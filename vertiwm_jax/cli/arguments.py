@@ -18,7 +18,7 @@ comes along.
 
 
 def read(kind: Any, name: str, words: Sequence[str], **options: Any) -> Any:
-    """Reads `words` into `kind`, a dataclass or the arguments of a function that is called.
+    """Reads `words` into one of the dataclasses that `kind`, a type or a union, names.
 
     Bad input ends the process with status 2 and an error that names the option.
     """

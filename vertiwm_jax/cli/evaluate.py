@@ -1,26 +1,23 @@
 """`vertiwm evaluate`: how well a model predicts, and a policy drives."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import tyro
 
+from vertiwm_jax.cli import arguments
 from vertiwm_jax.evaluation.calibration import CalibrationTest
 from vertiwm_jax.evaluation.prediction_report import PredictionTest
 from vertiwm_jax.evaluation.report import NavigationTest
 
-TESTS = {
-    "prediction": PredictionTest,
-    "calibration": CalibrationTest,
-    "navigation": NavigationTest,
-}
+Test = (
+    Annotated[PredictionTest, tyro.conf.subcommand("prediction")]
+    | Annotated[CalibrationTest, tyro.conf.subcommand("calibration")]
+    | Annotated[NavigationTest, tyro.conf.subcommand("navigation")]
+)
 
 
 def run(name: str, words: Sequence[str]) -> None:
-    test = tyro.extras.subcommand_cli_from_dict(
-        TESTS,
-        args=words,
-        prog=f"vertiwm {name}",
-        description=__doc__,
-        config=(tyro.conf.FlagConversionOff,),
-    )
+    off = (tyro.conf.FlagConversionOff,)
+    test = arguments.read(Test, name, words, description=__doc__, config=off)
     print(f"\n{test.run()}")

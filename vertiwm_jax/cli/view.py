@@ -89,17 +89,15 @@ def _beside(command: View) -> Path:
 
 def _scene(command: View) -> Scene:
     """A policy's drive, or a recorded one."""
-    source = command.source
-    if source.is_dir():
-        if command.drive is not None:
-            raise ConfigError(f"{source}: drive: is of a file of drives, found the folder of a run")
+    source, of_run = command.source, command.source.is_dir()
+    others = ("drive",) if of_run else ("suite", "task", "seed")
+    for name in others:
+        if getattr(command, name) is not None:
+            kind = "a file of drives" if of_run else "a policy"
+            raise ConfigError(f"{source}: {name}: is of {kind}")
+    if of_run:
         which = command.suite, command.task or 0, command.seed or 0
         return driven.load(source, command.model, command.weights, command.vehicle, *which)
-    for name in ("suite", "task", "seed"):
-        if getattr(command, name) is not None:
-            raise ConfigError(
-                f"{source}: {name}: is of a policy, expected the folder of a run, found none"
-            )
     shown = vehicle.load(command.vehicle or HMMWV).vehicle
     model = load_model(command.model, command.weights, vehicle=shown)
     return replace(recorded.load(source, command.drive or 0, command.model, *model), vehicle=shown)

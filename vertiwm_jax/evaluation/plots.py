@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vertiwm_jax import figures
+from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import picture
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -90,7 +91,6 @@ def trajectories(
     drives: Mapping[str, tuple[np.ndarray, np.ndarray]],
     goal: np.ndarray,
     goal_radius: float,
-    step_seconds: float,
 ) -> Figure:
     """Draws drives over the shaded map of one world, with roll and pitch over time beside it.
 
@@ -112,7 +112,7 @@ def trajectories(
             start, end = ("start", "end of a drive") if i == 0 else (None, None)
             overhead.plot(x[-1], y[-1], "s", color=color, markersize=5, label=end)
             overhead.plot(x[0], y[0], "o", **_MARK, markersize=5, label=start)
-            seconds = step_seconds * np.arange(len(rpy))
+            seconds = STEP_SECONDS * np.arange(len(rpy))
             for axes, angle in ((roll, rpy[:, 0]), (pitch, rpy[:, 1])):
                 axes.plot(seconds, np.degrees(angle), dash, color=color)
         draw_goal(overhead, goal, goal_radius)

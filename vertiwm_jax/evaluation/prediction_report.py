@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import jax
 import numpy as np
 
-from vertiwm_jax import config as configuration
 from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, settings
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.evaluation import error_sources, plots, prediction, wheels
@@ -22,7 +21,6 @@ from vertiwm_jax.evaluation.prediction import (
 )
 from vertiwm_jax.evaluation.tables import csv_text, markdown, write
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
@@ -38,6 +36,7 @@ from vertiwm_jax.world_model.fusion import COEFFICIENTS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+Models = Annotated[tuple[ModelName, ...], AtLeastOne]
 SHARES = (0.25, 0.5, 0.75, 0.95)
 """Windows that are pictured: those than which this share of all on such ground err less."""
 AROUND = 8
@@ -50,12 +49,7 @@ class PredictionTest:
 
     data: Path
     """Folder of `.npz` files of drives, with the maps they name."""
-    models: Annotated[tuple[ModelName, ...], AtLeastOne] = (
-        "vertiwm",
-        "nesam",
-        "transformer",
-        "builtin",
-    )
+    models: Models = ("vertiwm", "nesam", "transformer", "builtin")
     """The models."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
@@ -86,7 +80,9 @@ class PredictionTest:
             name: load_model(name, self.weights, vehicle=driven, soil=self.soil)
             for name in self.models
         }
-        models |= _fitted(self.compare)
+        for folder in self.compare:
+            fitted = load_fitted(folder / "model")
+            models |= {f"{folder.name}: {part}": model for part, model in fitted.items()}
         models["kinematic bicycle"] = KinematicBicycle(), bicycle_of(driven)
         models["constant velocity"] = ConstantVelocity(), None
         predicted = {}
@@ -102,16 +98,6 @@ class PredictionTest:
             drawn = {name: predicted[name] for name in self.models}
             write(self.output, dict(_files(errors, test, drawn)))
         return "\n\n".join(prediction.format_table(rows, "position") for rows in errors)
-
-
-def _fitted(folders: Sequence[Path]) -> dict[str, tuple[Dynamics, Params]]:
-    """Every model that was fitted in these runs; a name that two of them have gets the folder's."""
-    names = [configuration.load(FitConfig, folder / "config.yaml").name for folder in folders]
-    return {
-        f"{name if names.count(name) == 1 else folder.name}: {part}": model
-        for name, folder in zip(names, folders, strict=True)
-        for part, model in load_fitted(folder / "model").items()
-    }
 
 
 def _files(

@@ -32,7 +32,6 @@ from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import TaskConfig, TrainConfig, Trained
 from vertiwm_jax.simulators import processes
 from vertiwm_jax.simulators.chrono import Chrono
-from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -217,14 +216,15 @@ def drive(
 
 def by_suite(results: Results, suites: Sequence[str]) -> dict[str, Results]:
     """Splits the episodes of each policy by the suite of their world, of `suites` `[W]`."""
-    groups = {}
-    for name in dict.fromkeys(suites):
-        worlds = [world for world, found in enumerate(suites) if found == name]
-        groups[name] = {
-            policy: jax.tree.map(lambda x, rows=np.isin(result.world, worlds): x[rows], result)
-            for policy, result in results.items()
-        }
-    return groups
+
+    def part(result: NavigationResult, suite: str) -> NavigationResult:
+        rows = np.array(suites)[np.asarray(result.world)] == suite
+        return jax.tree.map(lambda x: x[rows], result)
+
+    return {
+        suite: {policy: part(result, suite) for policy, result in results.items()}
+        for suite in dict.fromkeys(suites)
+    }
 
 
 def write(
@@ -237,7 +237,7 @@ def write(
         first = next(iter(results.values()))
         paths = {policy: result.path(hard) for policy, result in results.items()}
         goal = np.asarray(first.goal[hard]), goal_radius
-        figure = plots.trajectories(terrain, int(first.world[hard]), paths, *goal, STEP_SECONDS)
+        figure = plots.trajectories(terrain, int(first.world[hard]), paths, *goal)
         drawn[f"trajectories_{name}.png"] = figure
     texts = {
         "summary.md": markdown(groups) + "\n",

@@ -28,13 +28,13 @@ MARGIN = 5.0
 """m from those at which the window moves on."""
 DOTS = 80
 """An inch."""
-COLORS = 56
-"""Of all frames, besides those of lines."""
+COLORS = 128
+"""Of all frames."""
 _LABELS = {TILT: "angle [deg]", FUSION: "0 Transformer,\n1 NeSAM"}
 """Of the panels that are drawn."""
 _DRIVEN, _PREDICTED = (figures.line(i)[0] for i in (0, 1))
 _ABOVE: dict[str, Any] = {
-    "loc": "lower left", "bbox_to_anchor": (0, 1), "ncols": 4, "borderaxespad": 0.2
+    "loc": "lower left", "bbox_to_anchor": (0, 1), "ncols": 4, "borderaxespad": 0.2, "fontsize": 8
 }  # fmt: skip
 
 Show = Callable[[int], None]
@@ -55,10 +55,8 @@ def write(scene: Scene, path: Path) -> None:
             canvas.draw()
             frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     # One palette for all frames, so that pixels that do not change are not stored again.
-    some = [np.asarray(frame) for frame in frames[:: max(1, len(frames) // 8)]]
-    palette = Image.fromarray(np.concatenate(some)).quantize(COLORS)
-    lines = b"".join(bytes.fromhex(figures.line(i)[0][1:]) for i in range(7)) + b"\xff" * 3
-    palette.putpalette((palette.getpalette() or [])[: 3 * COLORS] + list(lines))
+    palette = Image.fromarray(np.concatenate([np.asarray(frame) for frame in frames[::8]]))
+    palette = palette.quantize(COLORS, Image.Quantize.FASTOCTREE)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     data, duration = io.BytesIO(), round(1000 * EVERY * STEP_SECONDS)
     first.save(data, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
@@ -124,7 +122,8 @@ def _draw_map(axes: Axes, scene: Scene) -> Show:
         box(0.4 * length, 0.8 * width, -0.05 * length, facecolor="white", alpha=0.7),
     )
     lines, _ = axes.get_legend_handles_labels()
-    axes.legend(handles=lines + picture.ground_legend(scene.terrain, [scene.world]), **_ABOVE)
+    ground = picture.ground_legend(scene.terrain, [scene.world])
+    axes.legend(handles=lines + ground, **_ABOVE | {"ncols": 3})
     middles = _middles(scene)
 
     def show(step: int) -> None:

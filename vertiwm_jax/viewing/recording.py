@@ -81,12 +81,10 @@ def _ground(stream: rr.RecordingStream, scene: Scene) -> None:
         centers = np.column_stack([boxes[:, :2], base + boxes[:, 4] / 2])
         _still(stream, "world/obstacles", _boxes(centers, boxes[:, 2:], _OBSTACLE))
     if scene.goal is not None:
-        around = np.linspace(0, 2 * np.pi, 73)
-        ring = scene.goal[:2] + scene.goal_radius * np.stack([np.cos(around), np.sin(around)], 1)
-        heights = np.asarray(query.height(terrain, jnp.asarray(ring, jnp.float32)))
-        ring = np.column_stack([ring, heights + 0.2])
-        _still(stream, "world/goal", rr.Points3D([scene.goal], radii=0.6, colors=_rgb(_GOAL)))
-        _still(stream, "world/goal/ring", _lines([ring], _GOAL))
+        place, radius, color = [scene.goal], scene.goal_radius, _rgb(_GOAL)
+        _still(stream, "world/goal", rr.Points3D(place, radii=0.6, colors=color))
+        ring = rr.Cylinders3D(centers=place, radii=radius, lengths=2.0, colors=color)
+        _still(stream, "world/goal/ring", ring)
 
 
 def _vehicle(stream: rr.RecordingStream, scene: Scene) -> None:
