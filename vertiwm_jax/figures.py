@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Okabe and Ito (2008), without the yellow that vanishes on paper; dashes tell the rest.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 _DASHES = ("-", "--", "-.", ":")
 _STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -38,7 +38,7 @@ def save(figure: Figure, path: str | Path) -> None:
 
 def line(i: int) -> tuple[str, str]:
     """Color and dash of the i-th line of a plot."""
-    return _COLOURS[i % len(_COLOURS)], _DASHES[i % len(_DASHES)]
+    return _COLORS[i % len(_COLORS)], _DASHES[i % len(_DASHES)]
 
 
 def style():

@@ -1,7 +1,7 @@
-"""Soils that the map has wrong, estimated while driving, the weights of the model frozen.
+"""Estimates soils while driving, where the map has them wrong; the model's weights are frozen.
 
-A buffered extended Kalman filter: what a vehicle did in the last seconds is predicted once more
-from where it was, with the soils believed now, and where it really went corrects them.
+A buffered extended Kalman filter: it predicts the last seconds of the drive again, with the soils
+that it believes in now. Where the vehicle really went corrects them.
 """
 
 from dataclasses import replace
@@ -26,14 +26,17 @@ from vertiwm_jax.world_model.nesam import Nesam
 T = TypeVar("T")
 Six = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
 MARGIN = 0.05
-"""Share of `BOUNDS` from either end within which the filter starts: beyond, nothing would move."""
+"""Least distance of initial parameters from either end of `BOUNDS`, as a share of these.
+
+At the ends, the derivatives of all that depends on a logit are 0.
+"""
 LONGEST_STEP = 1.0
-"""Of an iteration, in logits: sinkage is far from linear in the moduli."""
+"""Largest step of an iteration, in logits: sinkage is far from linear in the moduli."""
 
 
 @struct.dataclass
 class SoilBelief:
-    """What is believed of K soils, and the last C + H steps of the drive that goes on.
+    """A belief about K soils, and a buffer of the last C + H steps of the drive.
 
     soils: leaves `[K, 6]` and `[K, 6, 6]`, logits of where in `BOUNDS` each parameter lies; rows
         of rigid classes are never used but finite.
@@ -54,9 +57,9 @@ class SoilBelief:
 class SoilFilter:
     """Estimates the six parameters of `BOUNDS` of each class of soil from how the vehicle moves.
 
-    A measurement is where H steps have taken the vehicle, in its body frame, after a history of C
-    steps before them. It counts for the class below the vehicle in all of the H steps. What is
-    not measured for long returns to what the map says.
+    A measurement is the pose increment of H steps in the body frame, predicted after a history of
+    C steps before them. It counts if the vehicle is on the same class in all of the H steps.
+    Parameters that are not measured for long return to what the map says.
     """
 
     context: CountOrZero = 8
@@ -66,8 +69,8 @@ class SoilFilter:
     prior: Positive = 1.5
     """Standard deviation of what the map says, in logits."""
     memory: Annotated[float, Bounds("more than 0 and at most 1", lambda x: 0 < x <= 1)] = 0.98
-    """Share of a deviation from the map that a measurement leaves to the next one; the rest is
-    forgotten, and what is known grows uncertain in step."""
+    """Share of the deviation from the map that remains at the next measurement. The rest is
+    forgotten, and the uncertainty grows accordingly."""
     noise: Six = (0.05, 0.05, 0.02, 0.02, 0.02, 0.02)
     """Standard deviations of what the model misses in H steps with the right soil: ahead, to the
     left and up, m, and about these axes, rad."""
@@ -78,7 +81,7 @@ class SoilFilter:
     """Gauss-Newton steps of a measurement; 1 is the extended filter."""
 
     def init(self, terrain: TerrainMap, state: VehicleState) -> SoilBelief:
-        """The soils of the map, at the start of a drive."""
+        """The belief at the start of a drive: the soils of the map."""
         soils, steps = self._of_map(terrain), self.context + self.horizon
         none = jnp.zeros(len(soils.mean), jnp.int32)
         return SoilBelief(
@@ -99,10 +102,10 @@ class SoilFilter:
         state: VehicleState,
         command: Command,
     ) -> SoilBelief:
-        """The belief after one more step of 0.1 s: `command` was held and led to `state`.
+        """Updates the belief after one more step of 0.1 s, in which `command` led to `state`.
 
-        Every H steps it measures; under `vmap`, which computes both sides of a condition, `record`
-        and `measure` called apart are cheaper. Raises like `measure`.
+        Every H steps it measures. Under `vmap`, which computes both sides of a condition, calling
+        `record` and `measure` separately is cheaper. Raises like `measure`.
         """
         belief = self.record(belief, state, command)
         return jax.lax.cond(
@@ -112,7 +115,7 @@ class SoilFilter:
         )
 
     def record(self, belief: SoilBelief, state: VehicleState, command: Command) -> SoilBelief:
-        """The belief with one more step in its buffer."""
+        """Puts one more step into the buffer."""
         return replace(
             belief,
             states=jnp.concatenate([belief.states[1:], state.vector[None]]),
@@ -123,11 +126,17 @@ class SoilFilter:
     def measure(
         self, model: Dynamics, params: Params, terrain: TerrainMap, belief: SoilBelief
     ) -> SoilBelief:
-        """The belief corrected by the H steps recorded last, once the drive has C + H steps.
+        """Corrects the belief by the last H recorded steps, once the drive has C + H steps.
 
-        terrain: the map as it was, of which only the soils are doubted. To measure more often than
-        every H steps would count them twice. Raises `ValueError` for a model that does not take
-        soils from the map, or whose gradients are not exact.
+        To measure more often than every H steps would count steps twice.
+
+        Args:
+            model, params: the model that predicts.
+            terrain: the map as it was; only its soils are in doubt.
+            belief: what is believed before.
+
+        Raises:
+            ValueError: the model does not take soils from the map, or its gradients are not exact.
         """
         _check(model, params)
         c = self.context
@@ -139,7 +148,7 @@ class SoilFilter:
         aged = self._aged(terrain, belief.soils)
 
         def residual(mean: jax.Array) -> jax.Array:
-            """How the end of the buffer differs from what these logits of the soil predict."""
+            """`[6]` recorded minus predicted pose at the end of the buffer, over the noise."""
             soils = replace(aged, mean=aged.mean.at[kind].set(mean))
             ground = believed(terrain, replace(belief, soils=soils))
             history = warm_up(model, params, ground, known, _at(commands, slice(c)))
@@ -176,7 +185,7 @@ class SoilFilter:
         return Gaussian(mean, jnp.broadcast_to(one, (*mean.shape, mean.shape[1])))
 
     def _aged(self, terrain: TerrainMap, soils: Gaussian) -> Gaussian:
-        """What remains of a belief at the next measurement: a process that returns to the map."""
+        """The belief at the next measurement, by a process that returns to the map."""
         prior, kept = self._of_map(terrain), self.memory
         return Gaussian(
             prior.mean + kept * (soils.mean - prior.mean),
@@ -185,7 +194,7 @@ class SoilFilter:
 
 
 def believed(terrain: TerrainMap, belief: SoilBelief) -> TerrainMap:
-    """The map with the soils that are believed in: what a model is to drive on."""
+    """The map with the soils of a belief, for a model to drive on."""
     unit_weight = query.soils(terrain).unit_weight
     return terrain.with_soils(from_unit(jax.nn.sigmoid(belief.soils.mean), unit_weight))
 
@@ -195,7 +204,7 @@ def _at(tree: T, place: Any) -> T:
 
 
 def _check(model: Dynamics, params: Params) -> None:
-    """`ValueError` for a model whose predictions do not tell how they depend on soils."""
+    """Raises `ValueError` for a model without exact derivatives by the soils of the map."""
     nesam = getattr(model, "nesam", getattr(model, "specialist", None))
     if isinstance(nesam, Nesam) and nesam.gradient != "exact":
         raise ValueError(

@@ -1,4 +1,4 @@
-"""`vertiwm compare`: train policies in several models and judge them all alike."""
+"""`vertiwm compare`: train policies in several models and test them all alike."""
 
 from collections.abc import Sequence
 

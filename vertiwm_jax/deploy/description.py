@@ -1,4 +1,4 @@
-"""A learned policy in plain numbers: what `policy.json` says of it, and its weights."""
+"""The content of `policy.json` and `policy.npz`: what the numbers of a policy mean, and weights."""
 
 import dataclasses
 from typing import Any
@@ -21,7 +21,7 @@ _SIZES = "length", "width", "wheelbase", "track", "ride_height", "steering_limit
 
 
 def about(policy: Policy) -> dict[str, Any]:
-    """What the numbers of a policy mean, for JSON."""
+    """The content of `policy.json`: what observations, actions and weights mean."""
     vehicle, speed_range = policy.config.vehicle.vehicle, policy.task.speed_range
     places, heading = observation.poses_ahead(vehicle)
     still = Command(jnp.float32(0), jnp.float32(0))
@@ -64,11 +64,11 @@ def about(policy: Policy) -> dict[str, Any]:
 
 
 def weights(policy: Policy) -> dict[str, np.ndarray]:
-    """Weights of the actor, by layer, and `mean` and `std` `[O]` of observations; float32."""
+    """Float32 weights of the actor by layer, and `mean` and `std` `[O]` of observations."""
     learned = policy.learned
     leaves = jax.tree.leaves_with_path(learned.params["params"])
     named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
-    named.pop("log_std", None)  # which only exploration needs
+    named.pop("log_std", None)  # Only exploration needs it.
     named |= {"mean": learned.observations.mean, "std": learned.observations.std}
     return {name: np.asarray(leaf, np.float32) for name, leaf in named.items()}
 

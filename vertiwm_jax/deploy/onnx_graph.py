@@ -1,4 +1,4 @@
-"""Records NumPy code as an ONNX graph: runs it once on arrays that note each operation."""
+"""Records NumPy code as an ONNX graph, by running it once on arrays that note each operation."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -28,10 +28,15 @@ _OPERATORS = {
 
 
 def record(function: Callable[[Any], Any], inputs: int, outputs: int) -> bytes:
-    """A serialized model of `function`: `observation` `[B, inputs]` to `action` `[B, outputs]`.
+    """Records a function of a float32 array as an ONNX model.
 
-    function: takes a float32 array and uses only NumPy functions that `Recorded` knows; others
-        raise `TypeError`. B is dynamic.
+    Args:
+        function: `[B, inputs]` to `[B, outputs]`, for any B. It may use only the NumPy functions
+            that `Recorded` knows; others raise `TypeError`.
+        inputs, outputs: numbers of columns.
+
+    Returns:
+        The serialized model, with the input `observation` and the output `action`.
     """
     graph = _Graph()
     result = graph.add("Identity", function(Recorded(graph, "observation")), output="action")
@@ -84,7 +89,7 @@ class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
     name: str
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any) -> "Recorded":
-        """Operators and functions of one number each."""
+        """Records an element-wise function."""
         add, floats = self.graph.add, [_as_float(x) for x in inputs]
         if method != "__call__":
             return NotImplemented
@@ -99,7 +104,7 @@ class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
     def __array_function__(
         self, function: Callable, types: Any, args: Sequence[Any], kwargs: dict[str, Any]
     ) -> "Recorded":
-        """Functions of whole arrays."""
+        """Records a function of whole arrays."""
         return _FUNCTIONS[function](*args, **kwargs) if function in _FUNCTIONS else NotImplemented
 
     def __getitem__(self, key: tuple[slice | int | None, ...]) -> "Recorded":
@@ -119,9 +124,9 @@ class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
         return x
 
     def _arctan2(self, y: "Recorded", x: "Recorded") -> "Recorded":
-        """Without a sign of zero: where y is 0 and x negative it is pi."""
+        """As `np.arctan2`, but for the sign of zero: where y is 0 and x negative, it is pi."""
         add = self.graph.add
-        # The angle of a vector that points up, y > 0 or not, is right; others lack half a turn.
+        # ONNX has no arctan2. Where x is negative, the arctangent lacks half a turn.
         safe = add("Where", add("Equal", x, 0.0), 1e-30, x)
         half_turn = add("Where", add("Less", y, 0.0), -np.pi, np.pi)
         return add("Atan", y / safe) + add("Where", add("Less", x, 0.0), half_turn, 0.0)

@@ -93,7 +93,7 @@ def _learned(about: About, weights: Weights, observation: np.ndarray) -> np.ndar
     *hidden, (kernel, bias) = _layers(weights, "MLP_0")
     for inner, inner_bias in hidden:
         features = np.tanh(features @ inner + inner_bias)
-    # Networks that also say how certain they are do so in what is left out here.
+    # Further columns of some networks are standard deviations, which are not used here.
     mean = features @ kernel[:, :2] + bias[:2] + steered * _float32([0, 1])
     return np.tanh(mean) if about["network"]["squashed"] else mean
 
@@ -122,8 +122,8 @@ def _look_ahead(about: About, observation: np.ndarray) -> np.ndarray:
     near_first = np.exp(-np.array(about["arcs"]["stations"]) / base["reach"])
     cost = np.sum(hard * _float32(near_first), axis=2)
     first, end = base["far"]
-    metres = about["observation"]["parts"]["route"]["scale"] / (end - first)
-    left = metres * np.sum(route[:, :, first:end], axis=2)
+    meters = about["observation"]["parts"]["route"]["scale"] / (end - first)
+    left = meters * np.sum(route[:, :, first:end], axis=2)
     share = _softmax(-(cost + base["onward"] * left) / base["spread"], axis=1)
     limit, steering = about["action"]["steering_limit"], _float32(about["arcs"]["steering"])
     return _action(about, limit * np.sum(share * steering, axis=1))

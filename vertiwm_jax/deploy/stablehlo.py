@@ -1,4 +1,4 @@
-"""Functions of JAX as files: StableHLO, which `jax.export.deserialize` reads with JAX alone."""
+"""JAX functions as StableHLO files, which `jax.export.deserialize` reads without this package."""
 
 from collections.abc import Callable
 from functools import partial
@@ -22,37 +22,37 @@ PLATFORMS = ("cpu", "cuda")
 
 
 def policy(act: Callable[[jax.Array], jax.Array], size: int) -> bytes:
-    """`act`, `[B, size]` float32 observations to `[B, 2]` actions, for any B."""
+    """Exports `act`: `[B, size]` float32 observations to `[B, 2]` actions, for any B."""
     (batch,) = export.symbolic_shape("batch")
     # A function, since a policy is a pytree, which cannot be hashed.
-    return _serialised(lambda seen: act(seen), _floats(batch, size))
+    return _serialized(lambda seen: act(seen), _floats(batch, size))
 
 
 def route(config: NavigationConfig, vehicle: Vehicle) -> bytes:
-    """The route to a goal over map arrays of any size; the arguments of `_route`."""
-    return _serialised(partial(_route, config, vehicle), *_map_arrays(), _floats(3))
+    """Exports the route to a goal on maps of any size, with the arguments of `_route`."""
+    return _serialized(partial(_route, config, vehicle), *_map_arrays(), _floats(3))
 
 
 def observe(config: NavigationConfig, vehicle: Vehicle, encoders: Encoders | None) -> bytes:
-    """`observation.observe` of map arrays, for maps of any size; the arguments of `_observe`.
+    """Exports `observation.observe` on maps of any size, with the arguments of `_observe`.
 
-    With encoders, the observation ends with the latents that they see.
+    With encoders, the observation ends with their latents of the ground.
     """
     seen = _floats(config.route.cells, config.route.cells), _floats(12), _floats(3), _floats(2)
-    return _serialised(partial(_observe, vehicle, encoders), *_map_arrays(), *seen)
+    return _serialized(partial(_observe, vehicle, encoders), *_map_arrays(), *seen)
 
 
 def _route(config: NavigationConfig, vehicle: Vehicle, *arguments: jax.Array) -> jax.Array:
-    """`[n, n]` m to the goal `[3]`, which follows the arguments of `_terrain`."""
+    """`[n, n]` cost to go, m; the arguments are those of `_terrain`, then the goal `[3]`, m."""
     *arrays, goal = arguments
     return config.route_to(_terrain(*arrays), vehicle, goal[:2]).cost[0]
 
 
 def _observe(driven: Vehicle, encoders: Encoders | None, *arguments: jax.Array) -> jax.Array:
-    """`[O]` seen on one world, given by the arguments of `_terrain`; what follows them:
+    """`[O]` the observation; the arguments are those of `_terrain`, then four more.
 
-    route: `[n, n]`, of `_route`; state: `[12]`, as `VehicleState.vector`; goal: `[3]` m; action:
-    `[2]` the last one.
+    route: `[n, n]`, of `_route`. state: `[12]`, as `VehicleState.vector`. goal: `[3]` m. action:
+    `[2]`, the last one.
     """
     *arrays, cost, state, goal, action = arguments
     terrain, vehicle = _terrain(*arrays), VehicleState.from_vector(state)
@@ -69,7 +69,7 @@ def _terrain(
     origin: jax.Array,
     resolution: jax.Array,
 ) -> TerrainMap:
-    """One world of the standard classes, whose arrays `TerrainMap` describes."""
+    """A map of one world with the standard classes; `TerrainMap` describes the arrays."""
     return TerrainMap(
         elevation=elevation[None],
         semantic=semantic[None],
@@ -99,5 +99,5 @@ def _floats(*shape: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(shape, jnp.float32)
 
 
-def _serialised(function: Callable[..., jax.Array], *arguments: jax.ShapeDtypeStruct) -> bytes:
+def _serialized(function: Callable[..., jax.Array], *arguments: jax.ShapeDtypeStruct) -> bytes:
     return bytes(export.export(jax.jit(function), platforms=PLATFORMS)(*arguments).serialize())
