@@ -17,7 +17,6 @@ from mkdocs.structure.files import File, Files
 
 import vertiwm_jax
 from vertiwm_jax import config as configuration_files
-from vertiwm_jax.cli.make_logs import MakeLogs
 from vertiwm_jax.config import default_config
 from vertiwm_jax.evaluation.compare import CompareConfig
 from vertiwm_jax.importers.settings import ImportSettings
@@ -36,7 +35,6 @@ COMMANDS = {
     "compare": CompareConfig,
     "collect": CollectConfig,
     "import_drives --settings": ImportSettings,
-    "make_logs": MakeLogs,
     "collect --vehicle": VehicleConfig,
 }
 

@@ -68,8 +68,7 @@ def test_the_world_may_begin_elsewhere(tmp_path):
 
 
 def test_the_newest_height_stays():
-    canvas = Canvas(1, 1.0)
-    canvas.paint(np.zeros((1, 2, 2)), np.array([0.25, 0.25]))
+    canvas = Canvas(np.zeros((1, 2, 2)), np.array([0.25, 0.25]), 1.0)
     canvas.paint(np.array([[[1.0, np.nan]]]), np.array([1.25, 0.25]))
     canvas.paint(np.full((1, 1, 1), 7.0), np.array([-0.75, -0.75]))
     expected = [[7, np.nan, np.nan], [np.nan, 0, 0], [np.nan, 1, 0]]

@@ -67,7 +67,7 @@ def run(*argv):
 
 
 def test_a_log_becomes_a_collection(folder, seen, tmp_path, capsys):
-    run(*arguments(folder, tmp_path / "drives"), "--map", folder / "level.npz", "--format", "csv")
+    run(*arguments(folder, tmp_path / "drives"), "--map", folder / "level.npz")
     out = capsys.readouterr().out
     assert f"{folder}/loops.csv" in out
     assert "| velocity, angular velocity | 26 | 1,004 | - |" in squeezed(out)
@@ -154,7 +154,9 @@ def test_refusals_are_one_line_and_leave_nothing(folder, seen, tmp_path):
 
     assert "--map MAP.npz" in message(*arguments(folder, output))
     assert "none.csv: expected a file or folder" in message(*arguments(folder, output, "none.csv"))
-    assert "expected --format" in message(*arguments(folder, output, "level.npz"), *with_map)
+    assert "expected a name that ends in one of .csv" in message(
+        *arguments(folder, output, "level.npz"), *with_map
+    )
     assert "no such file" in message(*arguments(folder, output, settings="none.yaml"), *with_map)
     assert "none.npz: file: expected" in message(
         *arguments(folder, output), "--map", folder / "none.npz"

@@ -155,7 +155,7 @@ def test_the_simulator_is_told_metres_a_second_and_radians():
     env.reset(seed=0)
     for action in ([0.0, -0.5], [7.0, 1.0]):
         env.step(np.array(action, np.float32))
-    np.testing.assert_allclose(ghosts[0].commands, [[3.0, -0.18625], [6.0, 0.3725]], rtol=1e-6)
+    np.testing.assert_allclose(ghosts[0].commands, [[2.5, -0.18625], [5.0, 0.3725]], rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from vertiwm_jax.errors import TrainingInterrupted, UserError
 
 _TRAININGS = ("ppo", "sac", "td3")
 COMMANDS = (
-    *_TRAININGS, "fit", "evaluate", "compare", "collect", "import_drives", "make_logs", "export",
+    *_TRAININGS, "fit", "evaluate", "compare", "collect", "import_drives", "export",
     "view", "identify",
 )  # fmt: skip
 _RESUME = "go on from the newest checkpoint with --resume and the run folder"

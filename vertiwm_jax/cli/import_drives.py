@@ -8,7 +8,7 @@ import tyro
 
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import AtLeastOne, settings
-from vertiwm_jax.importers.imports import Format, import_drives
+from vertiwm_jax.importers.imports import import_drives
 
 
 @settings
@@ -21,15 +21,12 @@ class ImportDrives:
     """Folder to make; the map is in its folder `maps`."""
     settings: Path
     """YAML file that names columns or topics, units and frames, and measures the vehicle."""
-    format: Format | None = None
-    """What the logs are; by default as their names end."""
     map: Path | None = None
     """The ground, an .npz map; by default that of a bag's GridMap topic."""
 
 
 def run(name: str, words: Sequence[str]) -> None:
     command = arguments.read(ImportDrives, name, words)
-    asked = {"format": command.format, "map": command.map}
-    print(import_drives(command.sources, command.output, command.settings, **asked))
+    print(import_drives(command.sources, command.output, command.settings, map=command.map))
     print(f"the drives are in {command.output}; to fit the world model to them:")
     print(f"python -m vertiwm_jax.fit --data {command.output}")

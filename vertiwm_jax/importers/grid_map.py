@@ -19,35 +19,22 @@ _KIND = "grid_map_msgs/msg/GridMap"
 class Canvas:
     """A raster of layers that grows as patches are painted; the newest value of a cell counts.
 
-    Cell (i, j) lies at x = resolution (corner[0] + i), y = resolution (corner[1] + j), m, plus
-    what the first patch was off from whole cells.
+    values: `[L, I, J]`, NaN where there are none; origin: `[2]` x, y of cell (0, 0), m.
     """
 
-    def __init__(self, layers: int, resolution: float) -> None:
-        self.resolution = resolution
-        self.values = np.full((layers, 0, 0), np.nan, np.float32)
-        self.corner = np.zeros(2, int)
-        self._offset: np.ndarray | None = None
-
-    @property
-    def origin(self) -> np.ndarray:
-        """`[2]` x, y of cell (0, 0), m."""
-        assert self._offset is not None
-        return self.resolution * self.corner + self._offset
+    def __init__(self, patch: np.ndarray, origin: np.ndarray, resolution: float) -> None:
+        self.values, self.origin, self.resolution = patch, origin, resolution
 
     def paint(self, patch: np.ndarray, origin: np.ndarray) -> None:
         """`[L, I, J]` values, NaN where there are none, of which cell (0, 0) lies at `[2]` m."""
-        if self._offset is None:
-            self.corner = np.floor(origin / self.resolution).astype(int)
-            self._offset = origin - self.resolution * self.corner
-        first = np.rint((origin - self._offset) / self.resolution).astype(int)
-        before = np.maximum(self.corner - first, 0)
-        after = np.maximum(first + patch.shape[1:] - self.corner - self.values.shape[1:], 0)
+        first = np.rint((origin - self.origin) / self.resolution).astype(int)
+        before = np.maximum(-first, 0)
+        after = np.maximum(first + patch.shape[1:] - self.values.shape[1:], 0)
         if before.any() or after.any():
             margins = [(0, 0), *zip(before, after, strict=True)]
             self.values = np.pad(self.values, margins, constant_values=np.nan)
-            self.corner = self.corner - before
-        i, j = first - self.corner
+            self.origin = self.origin - self.resolution * before
+        i, j = first + before
         under = self.values[:, i : i + patch.shape[1], j : j + patch.shape[2]]
         under[:] = np.where(np.isfinite(patch), patch, under)
 
@@ -65,13 +52,14 @@ def terrain(
     for path in paths:
         name = f"{path}: {wanted.topic}"
         for _, message in rosbag.messages(path, wanted.topic, (_KIND,)):
-            canvas = canvas or Canvas(len(names), message.info.resolution)
+            patch, origin = _patch(name, message, names)
+            canvas = canvas or Canvas(patch, origin, message.info.resolution)
             if not np.isclose(message.info.resolution, canvas.resolution):
                 raise DataError(
                     f"{name}: expected {canvas.resolution:g} m between cells as before, found "
                     f"{message.info.resolution:g}"
                 )
-            canvas.paint(*_patch(name, message, names))
+            canvas.paint(patch, origin)
     assert canvas is not None  # A topic without messages is refused.
     return _build(f"{paths[0]}: {wanted.topic}", canvas, wanted, frames)
 

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,20 +22,15 @@ from vertiwm_jax.runs import Progress
 from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain.map import TerrainMap
 
-Format = Literal["csv", "parquet", "rosbag"]
 Reader = Callable[[Path, ImportSettings], list[Log]]
-READERS: dict[Format, Reader] = {
-    "csv": partial(table.read, columns_of=table.csv_columns),
-    "parquet": partial(table.read, columns_of=table.parquet_columns),
-    "rosbag": rosbag.read,
+READERS: dict[str, Reader] = {
+    ".csv": partial(table.read, columns_of=table.csv_columns),
+    ".parquet": partial(table.read, columns_of=table.parquet_columns),
+    ".bag": rosbag.read,
+    ".db3": rosbag.read,
+    ".mcap": rosbag.read,
 }
-ENDINGS: dict[str, Format] = {
-    ".csv": "csv",
-    ".parquet": "parquet",
-    ".bag": "rosbag",
-    ".db3": "rosbag",
-    ".mcap": "rosbag",
-}
+"""Formats of logs, by how their names end."""
 PER_FILE = SPLITS["test"].stop
 """Drives in a file. The first of them are for training, the last for tests."""
 LARGEST_ANGLE = np.radians(20)
@@ -48,7 +42,6 @@ def import_drives(
     output: Path,
     settings_file: Path,
     *,
-    format: Format | None = None,
     map: Path | None = None,
 ) -> str:
     """Writes logged drives as a collection, which `fit` and `evaluate` read, at 10 Hz.
@@ -57,7 +50,6 @@ def import_drives(
         sources: files or folders of logs, in the order in which they were driven.
         output: the folder to make.
         settings_file: YAML of `ImportSettings`.
-        format: of the logs; by default as their names end.
         map: the ground, an `.npz` map; by default that of a bag's GridMap topic.
 
     Returns:
@@ -67,7 +59,7 @@ def import_drives(
         DataError, MapError, ConfigError: a file cannot be used; the message names it.
     """
     settings = configuration.load(ImportSettings, settings_file)
-    readers = [_reader(source, format) for source in sources]
+    readers = [_reader(source) for source in sources]
     with atomic.new_folder(output) as unfinished:
         terrain, said = _terrain(sources, settings_file, settings, map)
         drives, rows = list[Drive](), list[Row]()
@@ -93,18 +85,15 @@ def import_drives(
     return "\n".join([markdown(rows), "", *said, *remarks])
 
 
-def _reader(source: Path, asked: Format | None) -> Reader:
+def _reader(source: Path) -> Reader:
     if not source.exists():
         raise DataError(f"{source}: expected a file or folder of logs, found none")
-    if asked is None:
-        is_bag = (source / "metadata.yaml").is_file()
-        asked = "rosbag" if is_bag else ENDINGS.get(source.suffix)
-    if asked is None:
-        raise DataError(
-            f"{source}: expected --format, as the name does not tell what it is; one of "
-            + ", ".join(READERS)
-        )
-    return READERS[asked]
+    if (source / "metadata.yaml").is_file():
+        return rosbag.read
+    if source.suffix not in READERS:
+        endings = ", ".join(READERS)
+        raise DataError(f"{source}: expected a name that ends in one of {endings}, or a ROS 2 bag")
+    return READERS[source.suffix]
 
 
 def _terrain(

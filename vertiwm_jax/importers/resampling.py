@@ -55,8 +55,9 @@ def resample(log: Log, settings: Resampling, logged_point: np.ndarray) -> Resamp
                 found.left_out[f"shorter than {settings.shortest} steps"] += 1
                 continue
             at = np.minimum(start + STEP_SECONDS * np.arange(steps + 1), last)
-            drive = Drive(_state(log, poses, at, settings.window, logged_point), _held(log, at))
-            found.drives += _pieces(drive, settings.longest)
+            state = _state(log, poses, at, settings.window, logged_point)
+            latest = np.searchsorted(log.command_time, at[:-1] + _TOLERANCE, side="right") - 1
+            found.drives += _pieces(Drive(state, log.command[latest]), settings.longest)
     return found
 
 
@@ -86,42 +87,31 @@ def _runs(stamps: np.ndarray, gap: float) -> Iterator[slice]:
         yield slice(first, end)
 
 
-def _held(log: Log, at: np.ndarray) -> np.ndarray:
-    """`[T, 2]` commands that hold at the beginning of each step between `[T + 1]` moments."""
-    latest = np.searchsorted(log.command_time, at[:-1] + _TOLERANCE, side="right") - 1
-    return log.command[latest]
-
-
 def _state(
     log: Log, poses: slice, at: np.ndarray, window: float, logged_point: np.ndarray
 ) -> np.ndarray:
     """`[T + 1, 12]` states at `[T + 1]` moments, from poses without a gap."""
     time, position, rotation = log.time[poses], log.position[poses], log.rotation[poses]
     attitude = Slerp(time, rotation)(at)
-    velocity = _between(log.velocity, time, poses, at)
-    omega = _between(log.angular_velocity, time, poses, at)
+
+    def between(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(at, time, column) for column in values[poses].T], 1)
+
+    velocity = None if log.velocity is None else between(log.velocity)
+    omega = None if log.angular_velocity is None else between(log.angular_velocity)
     if velocity is None or omega is None:
         fitted = _slopes(time, position, rotation, at, attitude, window)
         velocity = attitude.inv().apply(fitted[:, :3]) if velocity is None else velocity
         omega = fitted[:, 3:] if omega is None else omega
-    place = np.stack([np.interp(at, time, column) for column in position.T], 1)
     return np.concatenate(
         [
-            place - attitude.apply(logged_point),
+            between(log.position) - attitude.apply(logged_point),
             attitude.as_euler("ZYX")[:, ::-1],
             velocity - np.cross(omega, logged_point),
             omega,
         ],
         axis=1,
     )
-
-
-def _between(
-    values: np.ndarray | None, time: np.ndarray, poses: slice, at: np.ndarray
-) -> np.ndarray | None:
-    if values is None:
-        return None
-    return np.stack([np.interp(at, time, column) for column in values[poses].T], 1)
 
 
 def _slopes(

@@ -70,14 +70,9 @@ def index(
     steps = start[:, None] + context + np.arange(horizon + 1)
     soft = np.asarray(terrain.deformable)[np.asarray(drives.wheel_class)]
     share = soft.mean(axis=-1)[drive[:, None], steps].mean(axis=-1)
-    ground = np.where(share == 0, 0, np.where(share == 1, 1, 2))
-    return WindowIndex(
-        drive=jnp.asarray(drive),
-        start=jnp.asarray(start),
-        ground=jnp.asarray(ground, jnp.int32),
-        context=context,
-        horizon=horizon,
-    )
+    ground = np.where(share == 0, 0, np.where(share == 1, 1, 2)).astype(np.int32)
+    drive, start, ground = map(jnp.asarray, (drive, start, ground))
+    return WindowIndex(drive, start, ground, context, horizon)
 
 
 @jax.jit

@@ -3,13 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
 from vertiwm_jax import geometry
 from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.simulator import (
-    GroundForces,
     Simulator,
     SimulatorHistory,
     SimulatorParams,
@@ -23,15 +21,6 @@ from vertiwm_jax.terrain.map import TerrainMap
 DYNAMICS = Simulator()
 
 
-@struct.dataclass
-class _Moving:
-    """The vehicle under way; forces: means over the last step."""
-
-    state: VehicleState
-    history: SimulatorHistory
-    forces: GroundForces
-
-
 class BuiltIn:
     """A vehicle on the selected world of a map, compiled once for all maps of one size.
 
@@ -43,40 +32,39 @@ class BuiltIn:
 
     def start(self, x: float, y: float, yaw: float) -> Observation:
         """As `Simulator.start`."""
-        pose = np.array([x, y, yaw], np.float32)
+        pose, none = np.array([x, y, yaw], np.float32), np.zeros(2)
         self._moving = _place(self._params, self._terrain, pose)
         for _ in range(round(SETTLE_SECONDS / STEP_SECONDS) - 1):
-            self.step(np.zeros(2))
-        return self.step(np.zeros(2))
+            self.step(none)
+        return self.step(none)
 
     def step(self, command: np.ndarray) -> Observation:
         """As `Simulator.step`."""
         command = np.asarray(command, np.float32)
-        self._moving, seen = _step(self._params, self._terrain, self._moving, command)
+        *self._moving, seen = _step(self._params, self._terrain, *self._moving, command)
         return jax.device_get(seen)
 
 
 @jax.jit
-def _place(params: SimulatorParams, terrain: TerrainMap, pose: jax.Array) -> _Moving:
+def _place(
+    params: SimulatorParams, terrain: TerrainMap, pose: jax.Array
+) -> tuple[VehicleState, SimulatorHistory]:
     state = place(terrain, pose[:2], pose[2], vehicle=params.vehicle)
-    history, none = DYNAMICS.init(params, terrain, state), jnp.zeros((4, 3))
-    return _Moving(state, history, GroundForces(none, none[0]))
+    return state, DYNAMICS.init(params, terrain, state)
 
 
 @jax.jit
 def _step(
-    params: SimulatorParams, terrain: TerrainMap, moving: _Moving, command: jax.Array
-) -> tuple[_Moving, Observation]:
+    params: SimulatorParams,
+    terrain: TerrainMap,
+    state: VehicleState,
+    history: SimulatorHistory,
+    command: jax.Array,
+) -> tuple[VehicleState, SimulatorHistory, Observation]:
     state, history, forces = DYNAMICS.step_with_forces(
-        params, terrain, moving.history, moving.state, Command.from_vector(command)
+        params, terrain, history, state, Command.from_vector(command)
     )
-    moving = _Moving(state, history, jax.tree.map(lambda x: jnp.mean(x, axis=0), forces))
-    return moving, _observe(params, terrain, moving)
-
-
-def _observe(params: SimulatorParams, terrain: TerrainMap, moving: _Moving) -> Observation:
-    state, history, vehicle = moving.state, moving.history, params.vehicle
-    rotation = geometry.rotation_from_rpy(state.rpy).as_matrix()
+    vehicle, rotation = params.vehicle, geometry.rotation_from_rpy(state.rpy).as_matrix()
     in_body = jnp.concatenate([vehicle.wheel_position, history.travel[:, None]], axis=-1)
     # Written out: a matmul may round map coordinates to ten bits on an accelerator.
     center = state.position + jnp.sum(rotation * in_body[:, None, :], axis=-1)
@@ -84,8 +72,8 @@ def _observe(params: SimulatorParams, terrain: TerrainMap, moving: _Moving) -> O
     wheels = WheelSignals(
         wheel_omega=history.wheel_speed,
         wheel_sinkage=depth,
-        wheel_force=moving.forces.wheels,
-        chassis_force=moving.forces.hull,
+        wheel_force=jnp.mean(forces.wheels, axis=0),
+        chassis_force=jnp.mean(forces.hull, axis=0),
         steer_angle=jnp.full(2, history.steering),
     )
-    return Observation(state.vector, wheel_class, wheels)
+    return state, history, Observation(state.vector, wheel_class, wheels)

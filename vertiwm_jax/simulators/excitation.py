@@ -45,7 +45,9 @@ def start(rng: np.random.Generator, terrain: TerrainMap, seconds: float) -> tupl
     good = (slope <= _STEEPEST_START) & ~blocked.any(axis=1)
     roomy = good & (edge > MARGIN + 2)
     crossing = roomy & (soft >= _BORDER_SHARE[0]) & (soft <= _BORDER_SHARE[1])
-    for wanted in (crossing if _is_mixed(terrain) else roomy, roomy, good):
+    soils = np.asarray(terrain.deformable[terrain.semantic[terrain.world]])
+    mixed = soils.any() and not soils.all()
+    for wanted in (crossing if mixed else roomy, roomy, good):
         if wanted.any():
             first = int(np.argmax(wanted))
             return (*xy[first].tolist(), float(yaw[first]))
@@ -94,8 +96,3 @@ def _surroundings(
     way = xy[:, None] + ahead[:, None] * heading[:, None]
     soft = terrain.deformable[query.surface(terrain, way).semantic]
     return slope, edge_distance(terrain, way[:, -1]), jnp.mean(soft, axis=-1)
-
-
-def _is_mixed(terrain: TerrainMap) -> bool:
-    soft = np.asarray(terrain.deformable[terrain.semantic[terrain.world]])
-    return bool(soft.any() and not soft.all())

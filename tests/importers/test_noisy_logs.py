@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 from importers.logged import commands, states
+from importers.noisy import noisy_logs
 from scipy.spatial.transform import Rotation
 
-from vertiwm_jax.importers import noise
-from vertiwm_jax.importers.noise import NoiseConfig
-
+NoiseConfig = noisy_logs.NoiseConfig
 STEPS, SCALE = 400, 4.0
 TIME = 0.1 * np.arange(STEPS + 1)
 EXACT = NoiseConfig(position=0.0, attitude=0.0, latency=0.0, dropped=0.0)
@@ -15,7 +14,7 @@ EXACT = NoiseConfig(position=0.0, attitude=0.0, latency=0.0, dropped=0.0)
 
 def logged(config):
     rng = np.random.default_rng(0)
-    return noise.logged(states(TIME), commands(TIME[:-1]), SCALE, config, rng)
+    return noisy_logs.logged(states(TIME), commands(TIME[:-1]), SCALE, config, rng)
 
 
 def test_without_noise_a_log_has_the_states_in_between_at_the_vehicles_size():

@@ -1,8 +1,9 @@
-"""Logs of recorded drives, and the way back: the command."""
+"""Logs of recorded drives, and the way back: the script beside the notebooks."""
 
 import numpy as np
 import pytest
 from doors import door, refusal, squeezed
+from importers.noisy import noisy_logs
 from learning import recordings
 
 from vertiwm_jax.learning import dataset, schema
@@ -23,7 +24,7 @@ def recorded(tmp_path_factory):
 def test_logs_of_a_rover_are_imported_as_they_were_recorded(recorded, tmp_path, capsys):
     logs = tmp_path / "logs"
     argv = [str(recorded), "--output", str(logs), "--vehicle", "rover", *QUIET]
-    door("make_logs")([*argv, "--noise.dropped", "0"])
+    noisy_logs.main([*argv, "--noise.dropped", "0"])
     printed = capsys.readouterr().out.splitlines()
     # 25 drives of 4 s take 4 s over the root of ten each.
     assert printed[0].startswith("0.5 minutes of logs")
@@ -54,10 +55,8 @@ def test_logs_of_a_rover_are_imported_as_they_were_recorded(recorded, tmp_path, 
 def test_what_cannot_be_logged_is_named(recorded, tmp_path):
     (tmp_path / "none").mkdir()
     other = ("--output", tmp_path / "logs")
-    assert "expected .npz files" in refusal(door("make_logs"), tmp_path / "none", *other)
-    message = refusal(door("make_logs"), recorded, *other, "--vehicle", "rovr")
+    assert "expected .npz files" in refusal(noisy_logs.main, tmp_path / "none", *other)
+    message = refusal(noisy_logs.main, recorded, *other, "--vehicle", "rovr")
     assert "did you mean 'rover'" in message
     assert not (tmp_path / "logs").exists()
-    assert "expected no such folder yet" in refusal(
-        door("make_logs"), recorded, "--output", recorded
-    )
+    assert "expected no such folder yet" in refusal(noisy_logs.main, recorded, "--output", recorded)

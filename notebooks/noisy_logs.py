@@ -1,15 +1,25 @@
-"""Turns simulated drives into logs as a real vehicle would write them: noisy, late, with gaps."""
+"""Turns recorded drives into logs as a real vehicle would write them: noisy, late, with gaps.
 
+    python notebooks/noisy_logs.py RECORDED --output LOGS --vehicle rover
+
+writes a CSV log a world, with the maps and the settings by which `import_drives` reads them.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import tyro
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from vertiwm_jax import atomic, froude
 from vertiwm_jax import config as configuration
 from vertiwm_jax.config import Bounds, NotNegative, Positive, settings
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.importers.settings import ImportSettings, Table, VehicleSettings
 from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.schema import DataError
@@ -133,3 +143,39 @@ def logged(
             control[step] * [second / meter, 1.0],
         ]
     )
+
+
+@dataclass(frozen=True)
+class MakeLogs:
+    """Write recorded drives as CSV logs with noise, latency and lost samples, a log a world."""
+
+    data: tyro.conf.Positional[Path]
+    """Folder of drives, as `collect` records them."""
+    output: Path
+    """Folder to make."""
+    vehicle: str = HMMWV
+    """What drove: the name of a vehicle that comes along, or a YAML file of one."""
+    noise: NoiseConfig = NoiseConfig()
+    """What the logs suffer from."""
+    seed: int = 0
+    """Decides everything that is random."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Writes the logs, and prints how to import them."""
+    asked = tyro.cli(MakeLogs, args=arguments)
+    try:
+        seconds, logs = make_logs(**vars(asked))
+    except UserError as error:
+        sys.exit(f"error: {error}")
+    made = asked.output
+    print(f"{seconds / 60:.1f} minutes of logs are in {made}; to import them:")
+    for log in logs:
+        print(
+            f"python -m vertiwm_jax.import_drives {made / log}.csv --settings "
+            f"{made / 'settings.yaml'} --map {made / 'maps' / log}.npz --output DRIVES/{log}"
+        )
+
+
+if __name__ == "__main__":
+    main()
