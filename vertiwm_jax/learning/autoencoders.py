@@ -123,7 +123,7 @@ class AutoencoderProblem(_PatchProblem):
 class SoilProblem(_PatchProblem):
     """A `fitting.Problem`: the soil under the vehicle, from what the ground around it looks like.
 
-    The map's own soils supervise; places on rigid ground teach nothing. Parameters are
+    The soils of the map are the targets; places on rigid ground do not count. Parameters are
     `semantic`, the frozen encoder of colors, and `soil`.
     """
 
@@ -172,7 +172,7 @@ def _errors(params: Params, terrain: TerrainMap, place: Places) -> tuple[jax.Arr
 
 
 def near(data: PatchData, key: jax.Array, config: AutoencoderConfig) -> Places:
-    """A batch of places near recorded ones, turned anyhow."""
+    """A batch of places near recorded ones, with random yaw."""
     row_key, offset_key, yaw_key = jax.random.split(key, 3)
     rows = jax.random.randint(row_key, (config.batch,), 0, len(data.places.yaw))
     places = jax.tree.map(lambda x: x[rows], data.places)

@@ -1,6 +1,6 @@
 """Fitting parameters to data: stochastic gradient descent as one compiled algorithm.
 
-What is fitted, and to what, is a `Problem`; this file knows batches only by their random keys.
+A `Problem` says what is fitted, and to what data. It draws each batch by a random key.
 """
 
 from dataclasses import dataclass, replace
@@ -53,9 +53,9 @@ class FitConfig:
     GONE: ClassVar[dict[str, str]] = {"accumulate": "is now grad_accumulation"}
 
     updates: CountOrZero = 10_000
-    """Optimizer steps (AdamW), each on a batch, or batches, of its own; 0 leaves the stage out."""
+    """Optimizer steps (AdamW), each on new batches; 0 leaves the stage out."""
     updates_per_iteration: Count = 100
-    """Updates between two validations, in one compiled call."""
+    """Updates between two validations; one compiled call does them."""
     grad_accumulation: Count = 1
     """Batches whose gradients make one update: a larger batch in the memory of one."""
     learning_rate: Positive = 1e-3

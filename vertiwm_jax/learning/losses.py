@@ -11,14 +11,14 @@ from vertiwm_jax.world_model import motion
 
 @settings
 class LossConfig:
-    """The trajectory loss (Eq. 11)."""
+    """The trajectory loss (Eq. 9)."""
 
     epsilon: Positive = 1e-3
     """Error, m or rad, below which the loss turns from linear to quadratic."""
     coefficient_change: NotNegative = 0.01
     """Weight of the change of fusion coefficients between steps (the paper's lambda_alpha)."""
     velocity: NotNegative = 0.0
-    """Weight of velocity (m/s) and angular velocity (rad/s), which Eq. 11 leaves out."""
+    """Weight of velocity (m/s) and angular velocity (rad/s), which Eq. 9 leaves out."""
 
 
 def trajectory_loss(
@@ -27,7 +27,7 @@ def trajectory_loss(
     recorded: VehicleState,
     coefficients: jax.Array | None = None,
 ) -> jax.Array:
-    """Loss `[...]` of K predicted states, leaves `[..., K, 3]` (Eq. 11).
+    """Loss `[...]` of K predicted states, leaves `[..., K, 3]` (Eq. 9).
 
     coefficients: `[..., K, 4]` fusion coefficients of the K steps, K at least 2, if the model has
     any. Horizontal position, height, roll and pitch, and yaw each give e^2 / (sg(e) + epsilon).

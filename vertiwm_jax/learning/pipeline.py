@@ -50,18 +50,18 @@ class SpecialistConfig:
     """How one specialist is fitted."""
 
     learns_from: tuple[Kind, ...] = KINDS
-    """Collections for it and for its encoders."""
+    """Which collections it and its encoders are fitted to."""
     autoencoders: FitConfig = FitConfig(updates=1000, weight_decay=0.0)
-    """Of terrain patches; the encoders are frozen afterwards."""
+    """The stage that fits autoencoders of terrain patches; their encoders are frozen afterwards."""
     single_steps: FitConfig = FitConfig(updates=400, warm_up=50)
-    """From recorded states: a cheap beginning."""
+    """The stage of single steps, each from a recorded state; it is cheap."""
     rollouts: FitConfig = FitConfig()
-    """Open loop, as it will be used."""
+    """The stage of open-loop predictions, which is how the model is used."""
 
     def training(self, *names: str) -> Self:
-        """The same, of which these parameters are trained."""
-        stages = {name: getattr(self, name) for name in ("single_steps", "rollouts")}
-        return replace(self, **{k: replace(stage, trainable=names) for k, stage in stages.items()})
+        """The same, with these parameters trained in both stages of motion."""
+        steps, rollouts = (replace(x, trainable=names) for x in (self.single_steps, self.rollouts))
+        return replace(self, single_steps=steps, rollouts=rollouts)
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,10 @@ class GateConfig:
     """How the gate is fitted, to both specialists as they are."""
 
     learns_from: tuple[Kind, ...] = ("mixed",)
-    """Collections for it."""
+    """Which collections it is fitted to."""
     rollouts: FitConfig = FitConfig(updates=600, warm_up=50, trainable=("gate.network",))
-    """Open loop; `trainable` may name parts of `transformer`, `nesam` and `encoders` too."""
+    """The stage of open-loop predictions; `trainable` may also name parts of `transformer`, `nesam`
+    and `encoders`."""
 
 
 @settings
@@ -81,24 +82,24 @@ class PipelineConfig:
     model: ModelConfig = ModelConfig()
     """What is fitted."""
     vehicle: str | None = None
-    """Whose physics NeSAM corrects: the name of a vehicle that comes along, or a YAML file of one;
-    by default that of the model to go on from, or else the HMMWV."""
+    """The vehicle whose physics NeSAM corrects: the name of one that comes along, or a YAML file.
+    By default that of the model to go on from, or else the HMMWV."""
     windows: WindowConfig = WindowConfig(weights=(1.0, 1.0, 2.0))
-    """Which windows of the drives."""
+    """Which windows of the drives are learned from."""
     loss: LossConfig = LossConfig(velocity=0.05)
-    """Of predictions."""
+    """The loss of open-loop predictions."""
     patches: autoencoders.AutoencoderConfig = autoencoders.AutoencoderConfig()
-    """Which patches of the ground, for autoencoders and soil predictor."""
+    """Which patches of the ground autoencoders and soil predictor are fitted to."""
     transformer: SpecialistConfig = SpecialistConfig().training(
         "transformer.network", "encoders.0.reduce"
     )
-    """The specialist for rigid ground."""
+    """How the specialist for rigid ground is fitted."""
     nesam: SpecialistConfig = SpecialistConfig().training("nesam.network")
-    """The specialist for soil."""
+    """How the specialist for soil is fitted."""
     soil: FitConfig = FitConfig(updates=2000, weight_decay=0.0, trainable=("soil",))
-    """The soil predictor."""
+    """How the soil predictor is fitted."""
     gate: GateConfig = GateConfig()
-    """What fuses the two."""
+    """How the gates that fuse both specialists are fitted."""
 
     def check(self):
         if self.vehicle:
