@@ -39,7 +39,7 @@ def moments(seen: Logged, steps: int, first: int = 0) -> np.ndarray:
 
 def test_logged_states_are_interpolated():
     seen = logged()
-    (drive,) = resample(build(seen, with_velocities=True), WHOLE, ORIGIN).drives
+    (drive,) = resample(build(seen, with_velocities=True), WHOLE, ORIGIN)[0]
     steps = int((seen.time[-1] - seen.time[0]) / 0.1)
     assert drive.control.shape == (steps, 2) and drive.state.shape == (steps + 1, 12)
     # Linear interpolation errs by (0.06 s)^2 / 8 of the second derivative at most, here 0.7 / s2.
@@ -49,7 +49,7 @@ def test_logged_states_are_interpolated():
 
 def test_a_command_holds_until_the_next():
     seen = logged()
-    (drive,) = resample(build(seen), WHOLE, ORIGIN).drives
+    (drive,) = resample(build(seen), WHOLE, ORIGIN)[0]
     for at, control in zip(moments(seen, len(drive.control)), drive.control, strict=False):
         latest = seen.time[seen.time <= at + 1e-6][-1]
         np.testing.assert_allclose(control, commands(np.array([latest]))[0])
@@ -68,7 +68,7 @@ def test_a_command_holds_until_the_next():
 def test_velocities_are_those_of_the_poses(rate, noise, window, largest):
     seen = logged(rate=rate, noise=noise)
     settings = replace(WHOLE, window=window)
-    (drive,) = resample(build(seen), settings, ORIGIN).drives
+    (drive,) = resample(build(seen), settings, ORIGIN)[0]
     error = errors(drive.state, moments(seen, len(drive.control)))
     np.testing.assert_array_less(rms(error), largest)
     if noise:  # Differences of poses 0.1 s apart are far worse.
@@ -80,7 +80,7 @@ def test_dropped_samples_cost_accuracy_and_no_more():
     kept = np.ones(len(seen.time), bool)
     hole = (seen.time > 105) & (seen.time < 105.4)
     kept[hole] = False
-    (drive,) = resample(build(seen, kept), WHOLE, ORIGIN).drives
+    (drive,) = resample(build(seen, kept), WHOLE, ORIGIN)[0]
     error = errors(drive.state, moments(seen, len(drive.control)))
     near = np.abs(moments(seen, len(drive.control)) - 105.2) < 0.5
     assert np.abs(error[near, :3]).max() < 0.05 and np.abs(error[near, 6:9]).max() < 0.15
@@ -90,11 +90,11 @@ def test_dropped_samples_cost_accuracy_and_no_more():
 def test_gaps_end_a_drive():
     seen = logged()
     kept = ~((seen.time > 105) & (seen.time < 105.6)) & ~((seen.time > 108) & (seen.time < 119.0))
-    found = resample(build(seen, kept), WHOLE, ORIGIN)
-    assert [len(drive.control) for drive in found.drives] == [49]
-    assert found.left_out == {"shorter than 32 steps": 2}
+    drives, left_out = resample(build(seen, kept), WHOLE, ORIGIN)
+    assert [len(drive.control) for drive in drives] == [49]
+    assert left_out == {"shorter than 32 steps": 2}
     wide = replace(WHOLE, gap=0.7, command_gap=0.7)
-    assert [len(d.control) for d in resample(build(seen, kept), wide, ORIGIN).drives] == [79]
+    assert [len(d.control) for d in resample(build(seen, kept), wide, ORIGIN)[0]] == [79]
 
 
 def test_drives_need_poses_and_commands():
@@ -109,22 +109,22 @@ def test_drives_need_poses_and_commands():
         command_time=seen.time[late],
         command=seen.command[late],
     )
-    (drive,) = resample(found, WHOLE, ORIGIN).drives
+    (drive,) = resample(found, WHOLE, ORIGIN)[0]
     start = seen.time[late][0]
     at = start + 0.1 * np.arange(len(drive.control) + 1)
     assert np.abs(errors(drive.state, at)).max() < 0.02
     # Half a second after the last command nobody knows what was commanded.
     early = replace(found, command_time=seen.time[~late], command=seen.command[~late])
-    (drive,) = resample(early, WHOLE, ORIGIN).drives
+    (drive,) = resample(early, WHOLE, ORIGIN)[0]
     assert len(drive.control) == int((seen.time[~late][-1] + 0.5 - seen.time[0]) / 0.1)
     never = replace(found, command_time=seen.time[late] + 100)
-    assert not resample(never, WHOLE, ORIGIN).drives
+    assert not resample(never, WHOLE, ORIGIN)[0]
 
 
 def test_long_drives_are_cut():
     seen = logged()
-    (whole,) = resample(build(seen), WHOLE, ORIGIN).drives
-    pieces = resample(build(seen), Resampling(longest=70), ORIGIN).drives
+    (whole,) = resample(build(seen), WHOLE, ORIGIN)[0]
+    pieces = resample(build(seen), Resampling(longest=70), ORIGIN)[0]
     assert [len(piece.control) for piece in pieces] == [66, 66, 67]
     np.testing.assert_array_equal(
         np.concatenate([piece.control for piece in pieces]), whole.control
@@ -139,7 +139,7 @@ def test_the_logged_point_may_lie_elsewhere():
     velocity = seen.state[:, 6:9] + np.cross(seen.state[:, 9:12], mast)
     for velocities in ({}, {"velocity": velocity, "angular_velocity": seen.state[:, 9:12]}):
         found = replace(build(seen), **velocities)
-        (drive,) = resample(found, WHOLE, mast).drives
+        (drive,) = resample(found, WHOLE, mast)[0]
         error = errors(drive.state, moments(seen, len(drive.control)))
         np.testing.assert_array_less(rms(error), (3e-4, 1e-4, 0.003, 0.003))
 

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -24,8 +23,8 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 Reader = Callable[[Path, ImportSettings], list[Log]]
 READERS: dict[str, Reader] = {
-    ".csv": partial(table.read, columns_of=table.csv_columns),
-    ".parquet": partial(table.read, columns_of=table.parquet_columns),
+    ".csv": table.read,
+    ".parquet": table.read,
     ".bag": rosbag.read,
     ".db3": rosbag.read,
     ".mcap": rosbag.read,
@@ -124,9 +123,9 @@ def _import(
     drives, left_out = list[Drive](), Counter[str]()
     point = scale * np.asarray(settings.vehicle.logged_point)
     for log in logs:
-        found = resampling.resample(log, settings.resampling, point)
-        drives += found.drives
-        left_out += found.left_out
+        found, short = resampling.resample(log, settings.resampling, point)
+        drives += found
+        left_out += short
     if drives:
         schema.check(source, _arrays(drives))
         way_off, _ = resampling.directions(drives)

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -26,23 +26,17 @@ class Drive:
     control: np.ndarray
 
 
-@dataclass
-class Resampled:
-    """The drives of a log, and the number of those left out, by the reason."""
-
-    drives: list[Drive] = field(default_factory=list)
-    left_out: Counter[str] = field(default_factory=Counter)
-
-
-def resample(log: Log, settings: Resampling, logged_point: np.ndarray) -> Resampled:
-    """The drives between the gaps of a log.
+def resample(
+    log: Log, settings: Resampling, logged_point: np.ndarray
+) -> tuple[list[Drive], Counter[str]]:
+    """The drives between the gaps of a log, and the number of those left out, by the reason.
 
     logged_point: `[3]` m in the body frame, the point whose position was logged. Positions and
     logged velocities are interpolated linearly, attitudes along the shortest rotation; a command
     holds until the next. Velocities that were not logged are slopes of parabolas that are fitted to
     the poses within `settings.window`.
     """
-    found = Resampled()
+    drives, left_out = list[Drive](), Counter[str]()
     for poses in _runs(log.time, settings.gap):
         for commands in _runs(log.command_time, settings.command_gap):
             last = log.time[poses][-1]
@@ -52,13 +46,13 @@ def resample(log: Log, settings: Resampling, logged_point: np.ndarray) -> Resamp
                 continue
             steps = int((end - start + _TOLERANCE) / STEP_SECONDS)
             if steps < settings.shortest:
-                found.left_out[f"shorter than {settings.shortest} steps"] += 1
+                left_out[f"shorter than {settings.shortest} steps"] += 1
                 continue
             at = np.minimum(start + STEP_SECONDS * np.arange(steps + 1), last)
             state = _state(log, poses, at, settings.window, logged_point)
             latest = np.searchsorted(log.command_time, at[:-1] + _TOLERANCE, side="right") - 1
-            found.drives += _pieces(Drive(state, log.command[latest]), settings.longest)
-    return found
+            drives += _pieces(Drive(state, log.command[latest]), settings.longest)
+    return drives, left_out
 
 
 def directions(drives: Sequence[Drive]) -> tuple[float, float]:

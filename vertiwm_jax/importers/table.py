@@ -2,7 +2,7 @@
 
 import csv
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,18 +14,17 @@ from vertiwm_jax.importers.settings import ImportSettings, Table
 from vertiwm_jax.learning.schema import DataError
 
 Columns = dict[str, np.ndarray]
-ColumnReader = Callable[[Path, Sequence[str]], Columns]
 
 
-def read(path: Path, settings: ImportSettings, columns_of: ColumnReader) -> list[Log]:
-    """The drives of a file, in the order in which they begin.
+def read(path: Path, settings: ImportSettings) -> list[Log]:
+    """The drives of a CSV or Parquet file, in the order in which they begin.
 
-    columns_of: `csv_columns` or `parquet_columns`. Raises `DataError` naming file, column and
-    expectation.
+    Raises `DataError` naming file, column and expectation.
     """
     table = settings.table
     if table is None:
         raise DataError(f"{path}: expected settings with a section `table` that names its columns")
+    columns_of = _parquet_columns if path.suffix == ".parquet" else _csv_columns
     columns = columns_of(path, _names(table))
     if table.drive is None:
         return [_log(str(path), columns, table, settings)]
@@ -38,7 +37,7 @@ def read(path: Path, settings: ImportSettings, columns_of: ColumnReader) -> list
     return logs
 
 
-def csv_columns(path: Path, names: Sequence[str]) -> Columns:
+def _csv_columns(path: Path, names: Sequence[str]) -> Columns:
     """Columns of a CSV file with a header line, as text."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file, warnings.catch_warnings():
@@ -58,7 +57,7 @@ def csv_columns(path: Path, names: Sequence[str]) -> Columns:
     return dict(zip(names, cells.T, strict=True))
 
 
-def parquet_columns(path: Path, names: Sequence[str]) -> Columns:
+def _parquet_columns(path: Path, names: Sequence[str]) -> Columns:
     """Columns of a Parquet file; needs pyarrow."""
     parquet = log.needed(path, "pyarrow.parquet")
     try:
