@@ -158,11 +158,7 @@ class SoilFilter:
             return motion.increment(_at(predicted, -1), end) / jnp.asarray(self.noise)
 
         posterior, plausible = kalman.correct(
-            _at(aged, kind),
-            residual,
-            self.gate,
-            self.iterations,
-            LONGEST_STEP,
+            _at(aged, kind), residual, self.gate, self.iterations, LONGEST_STEP
         )
         counts = (
             (belief.steps >= self.context + self.horizon)

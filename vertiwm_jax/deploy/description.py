@@ -28,11 +28,7 @@ def about(policy: Policy) -> dict[str, Any]:
     image = policy.learned.actor.layout.image
     seen = ObservationSpec(image=image is not None)
     parts = {
-        name: {
-            "slice": [part.where.start, part.where.stop, part.where.step or 1],
-            "unit": part.unit,
-            "scale": part.scale,
-        }
+        name: {"slice": part.where.indices(seen.size), "unit": part.unit, "scale": part.scale}
         for name, part in seen.parts.items()
     }
     return {

@@ -61,15 +61,13 @@ def _observe(driven: Vehicle, encoders: Encoders | None, *arguments: jax.Array) 
     return observation.observe(terrain, driven, vehicle, goal, route, action, latents)
 
 
-def _terrain(
-    elevation: jax.Array,
-    semantic: jax.Array,
-    friction: jax.Array,
-    obstacles: jax.Array,
-    origin: jax.Array,
-    resolution: jax.Array,
-) -> TerrainMap:
-    """A map of one world with the standard classes; `TerrainMap` describes the arrays."""
+def _terrain(*arrays: jax.Array) -> TerrainMap:
+    """A map of one world with the standard classes.
+
+    arrays: elevation, semantic, friction, obstacles, origin and resolution, as `TerrainMap`
+        describes them.
+    """
+    elevation, semantic, friction, obstacles, origin, resolution = arrays
     return TerrainMap(
         elevation=elevation[None],
         semantic=semantic[None],

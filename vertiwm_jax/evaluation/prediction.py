@@ -23,13 +23,9 @@ from vertiwm_jax.world_model.alone import AloneHistory
 from vertiwm_jax.world_model.nesam import NesamHistory
 from vertiwm_jax.world_model.verti_wm import VertiWMHistory
 
-MEASURES = {
-    "position": "m",
-    "horizontal": "m",
-    "height": "m",
-    "roll": "deg",
-    "pitch": "deg",
-    "yaw": "deg",
+MEASURES: dict[str, str] = {
+    **dict.fromkeys(("position", "horizontal", "height"), "m"),
+    **dict.fromkeys(("roll", "pitch", "yaw"), "deg"),
 }
 """Absolute errors and their units; position is the distance in space."""
 BATCH = 512
