@@ -1,4 +1,4 @@
-"""What all figures share: style, lines and files. Matplotlib is imported with the first figure."""
+"""Style, colors and files of all figures. Matplotlib is imported with the first figure."""
 
 from __future__ import annotations
 

@@ -54,16 +54,16 @@ def main(name: str | None = None, words: Sequence[str] | None = None) -> None:
 
 
 def prepare(name: str) -> None:
-    """Has a command use all cores, on all hosts; before gymnax is imported, which starts JAX."""
+    """Sets up all cores and hosts for a command; to be called before gymnax, which starts JAX."""
     machine.use_cores()
-    # Tracing makes many objects that stay: to look for garbage among them is a sixth of its time.
+    # Tracing makes many lasting objects; looking for garbage among them is a sixth of its time.
     gc.set_threshold(100_000, 50, 50)
     hosts.join(name)
 
 
 @contextmanager
 def failures_in_one_line(name: str) -> Iterator[None]:
-    """Ends the process at what a user can mend, of the command `name`, with a status not 0."""
+    """Ends the process with one line and a status that is not 0 where the user can correct it."""
     try:
         yield
     except TrainingInterrupted as stopped:
@@ -91,7 +91,7 @@ class _Teller(logging.Handler):
 
 @contextmanager
 def told() -> Iterator[None]:
-    """What the library logs is printed."""
+    """Prints what the library logs, while the context is open."""
     log, teller = logging.getLogger("vertiwm_jax"), _Teller()
     level, propagate = log.level, log.propagate
     log.addHandler(teller)

@@ -32,7 +32,7 @@ Arena = ModelName | Literal["chrono"]
 
 
 def expect(arena: Arena, config: TaskConfig) -> None:
-    """`SimulatorError` or `ConfigError` where policies of these settings cannot be tested there."""
+    """Raises `SimulatorError` or `ConfigError` where no test with these settings is possible."""
     if arena == "chrono":
         chrono.modules()
         if config.vehicle != HMMWV:
@@ -79,7 +79,7 @@ def _drive(
     keys: np.ndarray,
     number: int,
 ) -> NavigationResult:
-    """Task `number` alone; everything comes from and goes to host memory, as between processes."""
+    """Drives one task. Arrays come from and go to host memory, as they pass between processes."""
     asked, start = jax.tree.map(lambda x: x[number], (tasks, params.starts))
     params, agent, start = jax.device_put((params, agent, start))
     key = jax.random.wrap_key_data(jnp.asarray(keys[number]))

@@ -31,7 +31,7 @@ def load(
     task: int = 0,
     seed: int = 0,
 ) -> Scene:
-    """The policy of a run on a task that was held out of its training.
+    """Drives the policy of a run on a task that was held out of its training.
 
     Args:
         run: the folder of the training.
@@ -68,7 +68,7 @@ def drive(
     """Drives the first task of the pool to its end; `name` is that of the agent, for the title."""
 
     def shown(task: TaskParams, state: TaskState) -> tuple:
-        """The state, the command that led there, wheels and coefficients."""
+        """Keeps the state, the command that led there, wheels and coefficients."""
         command = task.vehicle.command(state.action, env.config.speed_range).vector
         alpha = getattr(state.history, "coefficients", None)
         return state.vehicle.vector, command, modeled_wheels(state.history), alpha

@@ -8,7 +8,7 @@ from vertiwm_jax.terrain.files import load_map
 
 
 def are_maps(source: Path) -> bool:
-    """Whether it is a map, or a folder of maps, and not a run or a file of drives."""
+    """Whether a path is a map or a folder of maps, and not a run or a file of drives."""
     if source.is_dir():
         files = [*source.glob("*.npz"), *source.glob("envs")]
         return bool(files) and not (source / "config.yaml").exists()
@@ -19,7 +19,7 @@ def are_maps(source: Path) -> bool:
 
 
 def draw(source: Path, path: Path | None = None) -> Path:
-    """Draws a map, or all maps of a folder; the file, which is beside them by default."""
+    """Draws a map, or all maps of a folder. Returns the file, by default beside them."""
     path = path or (source / "maps.png" if source.is_dir() else source.with_suffix(".png"))
     files = sorted(source.glob("*.npz")) if source.is_dir() else [source]
     figures.save(load_map(source).plot([file.stem for file in files] or None), path)

@@ -18,10 +18,16 @@ STEPS = 16
 
 
 def load(path: Path, drive: int, name: str, dynamics: Dynamics, params: Params) -> Scene:
-    """A drive of a file, by number, and what the model, called `name`, predicts every 16 steps.
+    """Loads a recorded drive, and predicts it every 16 steps.
 
-    Raises `DataError` or `MapError` on a file that cannot be used, that has no such drive, or of
-    which it is too short to predict anything.
+    Args:
+        path: a file of drives.
+        drive: number of the drive in the file.
+        name: what the model is called, for the title.
+        dynamics, params: the model.
+
+    Raises:
+        DataError, MapError: the file cannot be used, or has no such drive of 32 steps or more.
     """
     drives, terrain = dataset.load_file(path)
     count = len(drives.length)
