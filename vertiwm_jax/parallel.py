@@ -6,7 +6,7 @@ what is shared out already, everything is computed in one place.
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -155,14 +155,7 @@ def shard(function: Callable[..., T], in_specs: Sequence[Any], out_specs: Any) -
 def vmap(
     function: Callable[..., Any], in_axes: Sequence[int | None], chunk: int | None = None
 ) -> Callable[..., Any]:
-    """`jax.vmap` of a function, the batch shared out to the devices; arguments as in `batched`."""
-    return batched(jax.vmap(function, in_axes), in_axes, chunk)
-
-
-def batched(
-    function: Callable[..., Any], in_axes: Sequence[int | None], chunk: int | None = None
-) -> Callable[..., Any]:
-    """A function of batches, leaves `[B, ...]`, the batch shared out to the devices.
+    """`jax.vmap` of a function, the batch shared out to the devices.
 
     in_axes: 0 for arguments with the axis of the batch, None for others. All arrays must be
         arguments: what a function closes over is not on the device.
@@ -180,16 +173,14 @@ def batched(
 
         def of_device(*args: Any) -> Any:
             if turns == 1:
-                return function(*args)
+                return jax.vmap(function, in_axes)(*args)
             mapped = [arg for arg, axis in zip(args, in_axes, strict=True) if axis == 0]
 
-            def turn(mapped: list[Any]) -> Any:
-                own, all_ = iter(mapped), zip(args, in_axes, strict=True)
+            def of_one(row: list[Any]) -> Any:
+                own, all_ = iter(row), zip(args, in_axes, strict=True)
                 return function(*(next(own) if axis == 0 else arg for arg, axis in all_))
 
-            split = jax.tree.map(lambda x: x.reshape(turns, together, *x.shape[1:]), mapped)
-            found = jax.lax.map(turn, split)
-            return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
+            return jax.lax.map(of_one, mapped, batch_size=together)
 
         of_all = shard(of_device, [ROWS if axis == 0 else WHOLE for axis in in_axes], ROWS)
         if len(rows) == size:
@@ -214,6 +205,30 @@ def shared_out(function: Callable[..., T], batch: int) -> Callable[..., T]:
         return gather(over, result)
 
     return on_mesh
+
+
+def in_turns(function: Callable[[Any], T], batch: Any, at_a_time: int) -> T:
+    """What a function gives for all rows of leaves `[B, ...]`, of so many of which it is asked.
+
+    All results are in memory once, and those of one turn again.
+    """
+    size, found = len(jax.tree.leaves(batch)[0]), None
+    for first in range(0, size, at_a_time):
+        first = min(first, size - at_a_time)  # The last turn has some rows of the one before.
+        rows = slice(first, first + at_a_time)
+        given = function(jax.tree.map(lambda x, rows=rows: x[rows], batch))
+        if found is None:
+            found = jax.tree.map(lambda x: np.zeros((size, *x.shape[1:]), x.dtype), given)
+        found = _with_rows(found, given, first)
+    return cast(T, found)
+
+
+@partial(jax.jit, donate_argnums=0)
+def _with_rows(tree: T, some: T, first: jax.Array) -> T:
+    """The tree with some of its rows, `first` and those that follow it, replaced."""
+    return jax.tree.map(
+        lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, first, axis=0), tree, some
+    )
 
 
 def placed(tree: T, spec: PartitionSpec) -> T:

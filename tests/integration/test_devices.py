@@ -103,6 +103,21 @@ def test_results_of_what_is_shared_out_are_on_one_device():
     np.testing.assert_array_equal(result, 2 * np.arange(16))
 
 
+@pytest.mark.parametrize("at_a_time", [3, 5, 10])
+def test_turns_give_what_all_at_once_gives(at_a_time):
+    traced = []
+
+    @jax.jit
+    def function(batch):
+        traced.append(len(batch["a"]))
+        return {"sum": batch["a"] + batch["b"][:, 0], "first": batch["b"][:, :1]}
+
+    batch = {"a": jnp.arange(10), "b": jnp.arange(20).reshape(10, 2)}
+    found = parallel.in_turns(function, batch, at_a_time)
+    assert traced == [at_a_time]
+    chex.assert_trees_all_equal(found, function(batch))
+
+
 def with_three_cores(program: str) -> subprocess.CompletedProcess[str]:
     """What a new process that has so many cores makes of a program."""
     cores = "import os, sys; os.sched_getaffinity = lambda process: {0, 1, 2}\n"

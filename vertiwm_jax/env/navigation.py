@@ -28,6 +28,8 @@ from vertiwm_jax.terrain import obstacles, patches, query, sensing
 from vertiwm_jax.terrain.files import load_map
 from vertiwm_jax.terrain.map import TerrainMap
 
+_Placed = tuple[VehicleState, History]
+
 
 @dataclasses.dataclass(frozen=True)
 class NavigationEnv(environment.Environment[TaskState, TaskParams]):
@@ -85,17 +87,23 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
             starts=cast(TaskState, ()),
             start_observation=cast(jax.Array, ()),
         )
-        together = min(_chunk() * jax.device_count(), pool)
-        given = params, tasks, jnp.arange(pool)
+        # Not all at once: patches of thousands of vehicles fill gigabytes.
+        of_device = machine.together(cpu=64, accelerator=1024)
+        together = min(of_device * jax.device_count(), pool)
+        numbered = tasks, jnp.arange(pool)
         if settled:
-            starts, seen = parallel.shared_out(partial(_settle_once, self), together)(*given)
+            settle = parallel.shared_out(partial(_settle_once, self), together)
+            starts, seen = parallel.in_turns(lambda x: settle(params, *x), numbered, together)
             _check_finite(starts, tasks, config)
         else:
             # As they will settle, so that it is traced only once.
-            mesh = parallel.mesh(together)
+            mesh, some = parallel.mesh(together), jax.tree.map(lambda x: x[:together], numbered)
             with jax.set_mesh(mesh):
-                given = parallel.place(mesh, given)
-                starts, seen = jax.eval_shape(partial(_settle, self), *given)
+                given = parallel.place(mesh, (params, *some))
+                shapes = jax.eval_shape(partial(_settle, self), *given)
+            starts, seen = jax.tree.map(
+                lambda x: jax.ShapeDtypeStruct((pool, *x.shape[1:]), x.dtype), shapes
+            )
         return dataclasses.replace(params, starts=starts, start_observation=seen)
 
     def start(self, params: TaskParams, index: jax.Array) -> tuple[jax.Array, TaskState]:
@@ -247,11 +255,6 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         )
 
 
-def _chunk() -> int:
-    """Vehicles that a device settles at a time: patches of thousands of them fill gigabytes."""
-    return machine.together(cpu=64, accelerator=1024)
-
-
 @partial(jax.jit, static_argnames="env")
 def _settle(
     env: NavigationEnv, params: TaskParams, tasks: Tasks, numbers: jax.Array
@@ -260,36 +263,29 @@ def _settle(
 
     params: without starts; numbers: `[P]` int32, of the routes to the goals.
     """
-    return parallel.batched(partial(_settle_some, env), (None, 0, 0), _chunk())(
-        params, tasks, numbers
-    )
-
-
-# Apart, for what is traced inside of something else, as for its shapes, has no compiler options.
-_settle_once = xla.brief_jit(_settle, static_argnames="env")
-
-
-def _settle_some(
-    env: NavigationEnv, params: TaskParams, tasks: Tasks, numbers: jax.Array
-) -> tuple[TaskState, jax.Array]:
-    """As `_settle`, all at once."""
     model, config = env.dynamics, env.config
-    standing = Command(jnp.float32(0), jnp.float32(0))
 
-    def begin(task: Tasks) -> tuple[VehicleState, History]:
+    def standing() -> Command:
+        # Made where it is used: from outside of what devices share, it would be another type.
+        return Command(jnp.float32(0), jnp.float32(0))
+
+    @partial(parallel.vmap, in_axes=(None, 0))
+    def begin(params: TaskParams, task: Tasks) -> _Placed:
         terrain = params.terrain.select(task.world)
         state = place(terrain, task.start, task.yaw, vehicle=params.vehicle)
         return state, model.init(params.dynamics, terrain, state)
 
-    def stand(task: Tasks, state: VehicleState, history: History) -> tuple[VehicleState, History]:
-        terrain = params.terrain.select(task.world)
-        return step(model, params.dynamics, terrain, history, state, standing)
+    @partial(parallel.vmap, in_axes=(None, 0, 0))
+    def stand(params: TaskParams, task: Tasks, placed: _Placed) -> _Placed:
+        (state, history), terrain = placed, params.terrain.select(task.world)
+        return step(model, params.dynamics, terrain, history, state, standing())
 
+    @partial(parallel.vmap, in_axes=(None, 0, 0, 0))
     def start(
-        task: Tasks, number: jax.Array, vehicle: VehicleState, history: History
+        params: TaskParams, task: Tasks, number: jax.Array, placed: _Placed
     ) -> tuple[TaskState, jax.Array]:
-        terrain, zero = params.terrain.select(task.world), jnp.int32(0)
-        action = params.vehicle.action(standing, config.speed_range)
+        (vehicle, history), terrain = placed, params.terrain.select(task.world)
+        action, zero = params.vehicle.action(standing(), config.speed_range), jnp.int32(0)
         state = TaskState(
             time=zero,
             vehicle=vehicle,
@@ -308,11 +304,15 @@ def _settle_some(
     # Steps of all, and not all steps of each: inside of `vmap`, a scan is traced again until it is
     # known what of a history differs between vehicles.
     at_rest, _ = jax.lax.scan(
-        lambda moved, _: (jax.vmap(stand)(tasks, *moved), None),
-        jax.vmap(begin)(tasks),
+        lambda placed, _: (stand(params, tasks, placed), None),
+        begin(params, tasks),
         length=config.settle_steps,
     )
-    return jax.vmap(start)(tasks, numbers, *at_rest)
+    return start(params, tasks, numbers, at_rest)
+
+
+# Apart, for what is traced inside of something else, as for its shapes, has no compiler options.
+_settle_once = xla.brief_jit(_settle, static_argnames="env")
 
 
 def _check_finite(starts: TaskState, tasks: Tasks, config: NavigationConfig) -> None:
