@@ -37,7 +37,7 @@ def make_vec(num_envs: int = 1, **settings: Any) -> NavigationVectorEnv:
 def make_gymnax(**settings: Any) -> "GymnaxNavigation":
     """The task with its parameters as default ones; what `gymnax.make` calls."""
     env, params = make_env(**settings)
-    return GymnaxNavigation(env.dynamics, env.config, env.variation, params)
+    return GymnaxNavigation(env.dynamics, env.config, default_params=params)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ import pytest
 from env.worlds import BICYCLE, begin, bicycle_env, ground, task
 from flax import struct
 
-from vertiwm_jax.env.action_repeat import ActionRepeat
 from vertiwm_jax.env.agent import Now
 from vertiwm_jax.env.controllers import StraightToGoal
 from vertiwm_jax.env.episodes import run_episodes
@@ -83,7 +82,7 @@ def test_a_future_is_worth_its_rewards_and_what_is_expected_at_its_end(blocked):
     now, first = begin(env, params), jnp.array([0.2, 0.3])
     found = jax.jit(driver.imagine)(now, first[None], KEY)
     repeated, total, actions = (
-        ActionRepeat(env, 8, driver.base),
+        replace(env, action_repeat=8, base=driver.base),
         0.0,
         [first] + [driver.policy(now.observation)] * 2,
     )

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from typing import Any, Protocol
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.env.task import TaskParams, TaskState
@@ -63,6 +64,15 @@ class Reactive(Agent):
 
     def act(self, now: Now, memory: None, key: jax.Array) -> tuple[jax.Array, None]:
         return self.policy(now.observation, key), None
+
+
+def corrected(
+    base: Policy | None, observation: jax.Array, key: jax.Array, correction: jax.Array
+) -> jax.Array:
+    """The action `[..., A]` of a controller plus a correction; without a base, the correction."""
+    if base is None:
+        return correction
+    return jnp.clip(base(observation, key) + correction, -1.0, 1.0)
 
 
 def as_agent(driver: Policy | Agent) -> Agent:

@@ -16,7 +16,6 @@ from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.state import STEP_SECONDS
 
-FRAMES_PER_SECOND = round(1 / STEP_SECONDS)
 _ENDINGS = np.array([reason.name.lower() for reason in TerminationReason])
 
 
@@ -46,7 +45,7 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     render_mode: None or "rgb_array", a picture of the world from above.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / STEP_SECONDS)}  # noqa: RUF012
 
     def __init__(
         self, env: NavigationEnv, params: TaskParams, render_mode: str | None = None

@@ -13,6 +13,7 @@ from gymnax.environments import environment, spaces
 from vertiwm_jax import machine, parallel, xla
 from vertiwm_jax.dynamics import Dynamics, History, Params, disagreement, embedding, spread, step
 from vertiwm_jax.env import observation, route, suites
+from vertiwm_jax.env.agent import Policy, corrected
 from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
 from vertiwm_jax.env.reward import reward
 from vertiwm_jax.env.suites import GroundConfig, TaskError, Tasks, validate
@@ -35,13 +36,21 @@ _Placed = tuple[VehicleState, History]
 class NavigationEnv(environment.Environment[TaskState, TaskParams]):
     """Drives to a goal with actions in [-1, 1]^2, speed and steering, at 10 Hz.
 
-    Two environments of equal `dynamics`, `config` and `variation` are equal and share compiled
-    code. There are no default parameters: a ground must be chosen, see `make_params`.
+    Two environments of equal fields are equal and share compiled code. There are no default
+    parameters: a ground must be chosen, see `make_params`.
+
+    action_repeat: steps of 0.1 s for which an action is held. Exploration noise that lasts moves a
+        vehicle, where noise that changes at every step only shakes it, and there are fewer
+        decisions to assign credit to (Mnih et al., 2015).
+    base: a controller that acts at every step. The held action, in [-1, 1], is added to its action
+        (Silver et al., 2018, "Residual policy learning").
     """
 
     dynamics: Dynamics
     config: NavigationConfig = dataclasses.field(default_factory=NavigationConfig)
     variation: RandomizationConfig = RandomizationConfig()
+    action_repeat: int = 1
+    base: Policy | None = None
 
     def make_params(
         self,
@@ -121,11 +130,31 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
     def step_env(
         self, key: jax.Array, state: TaskState, action: int | float | jax.Array, params: TaskParams
     ) -> tuple[jax.Array, TaskState, jax.Array, jax.Array, dict[Any, Any]]:
-        """One step of 0.1 s; a state that diverged is replaced by the last plausible one.
+        """Holds an action for `action_repeat` steps, or until the episode ends; rewards add up.
 
-        An episode that is over stays as it is, and gives no reward. Only its history goes on, and
-        what is on its way to the vehicle: to keep that, all would be copied in every step.
+        A state that diverged is replaced by the last plausible one. An episode that is over stays
+        as it is, and gives no reward. Only its history goes on, and what is on its way to the
+        vehicle: to keep that, all would be copied in every step.
         """
+        if self.action_repeat == 1 and self.base is None:
+            return self._step(state, action, params)
+
+        def once(carry: tuple[jax.Array, TaskState], key: jax.Array) -> tuple:
+            observation, state = carry
+            acted = corrected(self.base, observation, key, jnp.asarray(action))
+            observation, state, *result = self._step(state, acted, params)
+            return (observation, state), result
+
+        first = self.observe(key, state, None, params), state
+        keys = jax.random.split(key, self.action_repeat)
+        (observation, state), (rewards, terminated, info) = jax.lax.scan(once, first, keys)
+        last = jax.tree.map(lambda x: x[-1], (terminated, info))
+        return observation, state, jnp.sum(rewards), *last
+
+    def _step(
+        self, state: TaskState, action: int | float | jax.Array, params: TaskParams
+    ) -> tuple[jax.Array, TaskState, jax.Array, jax.Array, dict[Any, Any]]:
+        """One step of 0.1 s."""
         config = self.config
         terrain = params.terrain.select(state.world)
         action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
@@ -199,7 +228,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
             "abs_pitch": jnp.abs(pitch),
             "distance": distance,
         }
-        return self.observe(key, new, action, params), new, gain, is_terminal(ending), info
+        return self.observe(None, new, action, params), new, gain, is_terminal(ending), info
 
     def observe(
         self,

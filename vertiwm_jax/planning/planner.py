@@ -10,8 +10,7 @@ from flax import struct
 
 from vertiwm_jax.config import Count, Discount, NotNegative, Positive, settings
 from vertiwm_jax.dynamics import History, Params, step
-from vertiwm_jax.env.action_repeat import ActionRepeat, corrected
-from vertiwm_jax.env.agent import Agent, Now
+from vertiwm_jax.env.agent import Agent, Now, corrected
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.models.registry import Imagined
 from vertiwm_jax.state import STEP_SECONDS
@@ -124,7 +123,7 @@ class Planner(Agent):
         Episodes end in imagination as they do in truth: a plan that fails forgoes all that would
         have come.
         """
-        env = ActionRepeat(self.env, self.interval, self.base)
+        env = replace(self.env, action_repeat=self.interval, base=self.base)
 
         def advance(carry: tuple, inputs: tuple[jax.Array, jax.Array]) -> tuple[tuple, None]:
             (observation, state, weight, total), (number, key) = carry, inputs

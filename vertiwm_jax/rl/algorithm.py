@@ -14,7 +14,6 @@ from gymnax.environments.environment import Environment
 
 from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, Positive, Share, settings
-from vertiwm_jax.env.action_repeat import ActionRepeat
 from vertiwm_jax.networks.policy import (
     ActionCritic,
     Actor,
@@ -162,7 +161,7 @@ class PolicyAlgorithm(Algorithm[S]):
     @property
     def timesteps(self) -> int:
         """Steps of 0.1 s, in all environments, in one iteration."""
-        held = self.env.times if isinstance(self.env, ActionRepeat) else 1
+        held = getattr(self.env, "action_repeat", 1)
         return self.config.num_envs * self.config.num_steps * held
 
     @property

@@ -12,7 +12,6 @@ from vertiwm_jax import machine, training
 from vertiwm_jax.config import ConfigError, Count
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import controllers, suites
-from vertiwm_jax.env.action_repeat import ActionRepeat
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.randomization import RandomizationConfig
@@ -136,7 +135,7 @@ class TrainConfig(TaskConfig):
 
     def algorithm(self, env: NavigationEnv) -> PolicyAlgorithm[Any]:
         """The algorithm on the task, as configured."""
-        repeated = ActionRepeat(env, self.action_repeat, self.controller)
+        repeated = replace(env, action_repeat=self.action_repeat, base=self.controller)
         return self.kind(repeated, self.schedule, outcomes, env.config.observed.layout)
 
     @property

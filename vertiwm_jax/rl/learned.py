@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.env.action_repeat import corrected
-from vertiwm_jax.env.agent import Policy
+from vertiwm_jax.env.agent import Policy, corrected
 from vertiwm_jax.networks.policy import (
     ActionCritic,
     Actor,

@@ -26,15 +26,10 @@ class Replay:
         rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), row)
         return cls(rows, jnp.int32(0), jnp.int32(0))
 
-    @property
-    def capacity(self) -> int:
-        """Rows that there is room for."""
-        return jax.tree.leaves(self.rows)[0].shape[0]
-
     def add(self, rows: Any) -> Self:
         """With N more rows, leaves `[N, ...]`, in place of the oldest; N divides the capacity."""
-        number = jax.tree.leaves(rows)[0].shape[0]
-        assert self.capacity % number == 0, (self.capacity, number)
+        capacity, number = (len(jax.tree.leaves(x)[0]) for x in (self.rows, rows))
+        assert capacity % number == 0, (capacity, number)
 
         def write(ring: jax.Array, new: jax.Array) -> jax.Array:
             return jax.lax.dynamic_update_slice_in_dim(ring, new, self.place, axis=0)
@@ -42,8 +37,8 @@ class Replay:
         return replace(
             self,
             rows=jax.tree.map(write, self.rows, rows),
-            place=(self.place + number) % self.capacity,
-            filled=jnp.minimum(self.filled + number, self.capacity),
+            place=(self.place + number) % capacity,
+            filled=jnp.minimum(self.filled + number, capacity),
         )
 
     def sample(self, key: jax.Array, number: int) -> Any:
