@@ -21,7 +21,7 @@ TASK = task((-30.0, 0.0), (30.0, 0.0))
 AHEAD = jnp.array([0.6, 0.0])
 
 
-def drive(env, params, steps=70):
+def drive(env, params, steps=90):
     """Observations and states of each step, `[T, ...]`."""
 
     @jax.jit
