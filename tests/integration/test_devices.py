@@ -209,7 +209,7 @@ def test_fitting_on_two_devices_is_fitting_on_one(two):
     data = WindowData.of(config, (drives, terrain), (drives, terrain))
     problem = WindowProblem(model, RolloutLoss(model), config)
     fit = Fit(problem, FitConfig(updates=4, updates_per_iteration=4, warm_up=1))
-    assert problem.batch == 16
+    assert problem.config.batch == 16
     inputs = FitInputs(jax.tree.map(jnp.asarray, params), data)
     start = fit.init(inputs, jax.random.key(0))
 

@@ -33,6 +33,10 @@ class Line:
     lost: float = 0.0
     batch: int = 8
 
+    @property
+    def config(self):
+        return self
+
     def loss(self, params, data, key):
         rows = jax.random.randint(key, (self.batch,), 0, len(data))
         spoilt = jax.random.uniform(jax.random.fold_in(key, 1)) < self.lost

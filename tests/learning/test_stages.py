@@ -22,6 +22,10 @@ class Pull:
     target: float = 3.0
     batch: int = 1
 
+    @property
+    def config(self):
+        return self
+
     def loss(self, params, data, key):
         return (params - self.target) ** 2
 

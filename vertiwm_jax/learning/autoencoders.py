@@ -76,18 +76,10 @@ class PatchData:
 
 
 @dataclass(frozen=True)
-class _PatchProblem:
-    """A `fitting.Problem` on patches of ground."""
+class AutoencoderProblem:
+    """A `fitting.Problem`: the squared error of reconstructed elevations and colors."""
 
     config: AutoencoderConfig
-
-    @property
-    def batch(self) -> int:
-        return self.config.batch
-
-
-class AutoencoderProblem(_PatchProblem):
-    """A `fitting.Problem`: the squared error of reconstructed elevations and colors."""
 
     def init_params(self, key: jax.Array) -> Params:
         """Untrained networks `elevation` and `semantic`."""
@@ -120,12 +112,15 @@ class AutoencoderProblem(_PatchProblem):
         }
 
 
-class SoilProblem(_PatchProblem):
+@dataclass(frozen=True)
+class SoilProblem:
     """A `fitting.Problem`: the soil under the vehicle, from what the ground around it looks like.
 
     The soils of the map are the targets; places on rigid ground do not count. Parameters are
     `semantic`, the frozen encoder of colors, and `soil`.
     """
+
+    config: AutoencoderConfig
 
     def loss(self, params: Params, data: PatchData, key: jax.Array) -> jax.Array:
         """Mean squared error `[]` of the six parameters, each as its share of `BOUNDS`."""

@@ -33,8 +33,8 @@ class Problem(Protocol):
     """What is fitted: a loss on random batches of data, and an error on data held out."""
 
     @property
-    def batch(self) -> int:
-        """Rows in a batch, which devices can share."""
+    def config(self) -> Any:
+        """Settings; their `batch` is the number of rows in a batch, which devices can share."""
         ...
 
     def loss(self, params: Params, data: Any, key: jax.Array, /) -> jax.Array:
@@ -119,7 +119,7 @@ class Fit(Algorithm[FitState]):
 
     @property
     def batch(self) -> int:
-        return self.problem.batch
+        return self.problem.config.batch
 
     def init(self, data: FitInputs, key: jax.Array) -> FitState:
         """The beginning; `ConfigError` if `trainable` names what the parameters do not have."""

@@ -27,7 +27,7 @@ from vertiwm_jax.learning.stages import Inputs
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import VehicleConfig, load_vehicle
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.config import ModelConfig, with_soil
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.runs import Run
@@ -117,11 +117,6 @@ class PipelineConfig:
                 f"{self.model.gates}, found {', '.join(learned)}"
             )
 
-    @property
-    def driven(self) -> VehicleConfig | None:
-        """The vehicle, if one is chosen; `ConfigError` if there is no such."""
-        return vehicle.load(self.vehicle) if self.vehicle else None
-
 
 def fit(
     config: PipelineConfig,
@@ -147,7 +142,7 @@ def fit(
     Raises:
         DataError, MapError, ConfigError: of `load_drives`, `WindowData.of` and `fitting.fit`.
     """
-    driven = config.driven
+    driven = vehicle.load(config.vehicle) if config.vehicle else None
     begun = () if driven is None else (str(driven),)
     if start is not None:
         start = start if driven is None else replace(start, vehicle=jax.device_put(driven.vehicle))
@@ -233,10 +228,8 @@ class _Pipeline:
         kinds, patches = getattr(self.config, name).learns_from, self.config.patches
         places = cache(lambda: autoencoders.PatchData.of(patches, *self._drives(kinds)))
         seeing = "transformer" if self.config.model.encoders == "shared" else name
-        problem, schedule = (
-            autoencoders.AutoencoderProblem(patches),
-            getattr(self.config, seeing).autoencoders,
-        )
+        schedule = getattr(self.config, seeing).autoencoders
+        problem = autoencoders.AutoencoderProblem(patches)
         pair = problem.init_params(self._key(seeing))
         stage = f"{seeing}_autoencoders", problem, schedule, kinds
         pair, digest = self._fit(*stage, pair, places)

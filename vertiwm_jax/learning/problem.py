@@ -95,10 +95,6 @@ class WindowProblem:
     objective: Objective
     config: WindowConfig
 
-    @property
-    def batch(self) -> int:
-        return self.config.batch
-
     def loss(self, params: Params, data: WindowData, key: jax.Array) -> jax.Array:
         """The mean objective `[]` of a batch of windows."""
         draw_key, mirror_key = jax.random.split(key)
