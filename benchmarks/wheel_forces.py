@@ -20,19 +20,19 @@ def main() -> None:
     soil = jax.tree.map(lambda x: x[(uniform[0] * 3).astype(int)], soils)
     wheel, contact = Wheel(jnp.float32(0.467), jnp.float32(0.254)), BekkerWongParams()
     sinkage, velocity_x = 0.1 * uniform[1], 5 * uniform[2]
-    state = (sinkage, velocity_x, uniform[3] - 0.5, 12 * uniform[4])
+    motion = velocity_x, uniform[3] - 0.5, 12 * uniform[4]
     load = 6000 * jnp.ones_like(sinkage)
 
-    def forces(wheel, soil, contact, *state):
-        return contact.forces(wheel, soil, *state)
+    def forces(wheel, soil, contact, sinkage, motion):
+        return contact.forces(wheel, soil, sinkage, motion)
 
     def total(*arguments):
         return sum(jnp.sum(x) for x in jax.tree.leaves(forces(*arguments)))
 
     cases = {
-        "forces": (forces, state),
-        "forces and gradient": (jax.value_and_grad(total, argnums=(1, 3, 4, 5, 6)), state),
-        "equilibrium sinkage": (equilibrium_sinkage, (load, *state[1:])),
+        "forces": (forces, (sinkage, motion)),
+        "forces and gradient": (jax.value_and_grad(total, argnums=(1, 3, 4)), (sinkage, motion)),
+        "equilibrium sinkage": (equilibrium_sinkage, (load, motion)),
     }
     results = {}
     for name, (function, inputs) in cases.items():

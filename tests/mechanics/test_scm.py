@@ -20,8 +20,8 @@ SHARP = ScmParams(creep_speed=1e-5)
 SMOOTH = ScmParams(creep_speed=0.4)
 
 
-def scm_forces(wheel, soil, contact, *state, **nodes):
-    return contact.forces(wheel, soil, *state, **nodes)
+def scm_forces(wheel, soil, contact, sinkage, vx, vy, omega, *rut, **nodes):
+    return contact.forces(wheel, soil, sinkage, (vx, vy, omega), *rut, **nodes)
 
 
 run = jax.jit(scm_forces, static_argnames="nodes")

@@ -18,8 +18,8 @@ EXACT = {"creep_speed": 1e-4}  # the published equations know no rest
 def settle(wheel, soil, contact, load, velocity_x, velocity_y, rim_speed):
     """Equilibrium sinkage and forces."""
     motion = (velocity_x, velocity_y, rim_speed / wheel.radius)
-    sinkage = equilibrium_sinkage(wheel, soil, contact, load, *motion)
-    return sinkage, contact.forces(wheel, soil, sinkage, *motion)
+    sinkage = equilibrium_sinkage(wheel, soil, contact, load, motion)
+    return sinkage, contact.forces(wheel, soil, sinkage, motion)
 
 
 def reece_soil(width_inch, k1, k2, n, cohesion, phi):
@@ -68,8 +68,9 @@ def test_towed_wheel_on_compact_sand():
 def test_reversal_of_a_towed_wheel():
     wheel = Wheel(24.7 * INCH, 6 * INCH)
     contact = BekkerWongParams(reversal="rankine", **EXACT)
-    motion = bekker_wong.motion(wheel, 1e-4, 12.16, np.float32(0), np.float32(10 / wheel.radius))
-    patch = bekker_wong.patch(contact, COMPACT.friction_angle, np.float32(5.149 / 24.7), motion)
+    motion = 12.16, np.float32(0), np.float32(10 / wheel.radius)
+    travel = bekker_wong.travel(wheel, 1e-4, motion)
+    patch = bekker_wong.patch(contact, COMPACT.friction_angle, np.float32(5.149 / 24.7), travel)
     np.testing.assert_allclose(np.rad2deg(patch.reversal), 15.286, rtol=1e-3)
 
 

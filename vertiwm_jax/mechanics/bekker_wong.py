@@ -10,7 +10,6 @@ Wong, Theory of Ground Vehicles, 4th ed. (2008), ch. 2; Pavlov and Johnson, J. T
 (2024).
 """
 
-from functools import partial
 from typing import Literal, NamedTuple
 
 import jax
@@ -19,17 +18,18 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax.mechanics.wheel import (
-    MAX_SINKAGE,
-    MIN_SINKAGE,
+    Arrays,
+    Motion,
     Scalar,
     Wheel,
     WheelForces,
+    broadcast,
     contact_angle,
+    depth_below,
+    integrated,
     sin_cos,
 )
 from vertiwm_jax.terrain.soil import Soil
-
-Arrays = tuple[jax.Array, ...]
 
 PANELS = 5
 """Pieces of the contact within which the stresses are smooth; see `breaks`."""
@@ -72,9 +72,7 @@ class BekkerWongParams:
         wheel: Wheel,
         soil: Soil,
         sinkage: Scalar,
-        velocity_x: Scalar,
-        velocity_y: Scalar,
-        omega: Scalar,
+        motion: Motion,
         rut: Scalar = 0.0,
         nodes: int = 6,
     ) -> WheelForces:
@@ -85,46 +83,38 @@ class BekkerWongParams:
         gradients are finite for any finite state. Only a wheel that spins against its travel as
         fast as it travels jumps, when the direction in which it enters the soil changes.
         """
-        arguments = (self, wheel, soil, sinkage, velocity_x, velocity_y, omega, rut)
-        arguments = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), arguments)
-        shape = jnp.broadcast_shapes(*(x.shape for x in jax.tree.leaves(arguments)))
-        contact, wheel, soil, sinkage, velocity_x, velocity_y, omega, rut = arguments
+        shape, given = broadcast((self, wheel, soil, sinkage, motion, rut))
+        contact, wheel, soil, sinkage, motion, rut = given
 
-        m = motion(wheel, contact.creep_speed, velocity_x, velocity_y, omega)
+        m = travel(wheel, contact.creep_speed, motion)
         n = soil.n + contact.slip_sinkage * jnp.maximum(m.slip, 0.0)
         n = n + contact.skid_sinkage * jnp.maximum(-m.slip, 0.0)
         keq = soil.kc / wheel.width + soil.kphi
         floor, unload = reloading(contact, keq, n, rut)
 
-        depth = jnp.clip((sinkage - floor) / wheel.radius, 0.0, MAX_SINKAGE)
-        touching = depth > MIN_SINKAGE
-        depth = jnp.where(touching, depth, MIN_SINKAGE)
+        depth, touching = depth_below(floor, sinkage, wheel)
         p = patch(contact, soil.friction_angle, depth, m)
         starts = jnp.stack(breaks(p, m))
         extents = jnp.diff(starts, axis=0)
 
-        @partial(jax.checkpoint, prevent_cse=False)
-        def add_node(total: Arrays, node: Arrays) -> tuple[Arrays, None]:
-            panel, point, weight = node
+        def stresses(
+            panel: jax.Array, point: jax.Array, weight: jax.Array
+        ) -> tuple[jax.Array, Arrays]:
             extent = extents[panel]
             at = arc(p, starts[panel] + point * extent)
             z = wheel.radius * pressing_depth(p, at.angle)
             sigma = normal_stress(keq, n, unload, floor, z)
             tau_x, tau_y = shear_stress(soil, contact, p, m, at, sigma)
             side = bulldozing(soil, contact, wheel.radius, p, m, at)
-            integrands = (
+            found = (
                 tau_x * at.cos - m.rolling * sigma * at.sin,
                 wheel.width * tau_y + side,
                 sigma * at.cos + m.rolling * tau_x * at.sin,
                 tau_x,
             )
-            weight = weight * extent
-            return tuple(t + weight * y for t, y in zip(total, integrands, strict=True)), None
+            return weight * extent, found
 
-        # A loop over nodes, each a pass over all wheels, is many times faster than an axis of
-        # nodes: nothing of a node goes through memory, nor, with the checkpoint, in the backward
-        # pass.
-        total, _ = jax.lax.scan(add_node, (jnp.zeros(shape),) * 4, _quadrature(nodes))
+        total = integrated(stresses, _quadrature(nodes), shape)
         longitudinal, lateral, normal, torque = (jnp.where(touching, t, 0.0) for t in total)
         area = wheel.radius * wheel.width
         return WheelForces(
@@ -141,12 +131,12 @@ LOOSE_SAND = BekkerWongParams(peak=0.18, peak_slip=0.32)
 """Wong and Reece (1967)."""
 
 
-class Motion(NamedTuple):
+class Travel(NamedTuple):
     """A wheel's motion seen along its travel, so that the soil is always entered ahead.
 
     ahead: 1 forwards, -1 in reverse. hub, rim: m/s along the travel. lateral: m/s to the left.
     spin: |omega| in rad/s, never zero. rolling: 1, fading to 0 at rest, where "ahead" has no
-    meaning. slip: see `slip`.
+    meaning. slip: in [-1, 1], 1 - v/(r w) driven, r w/v - 1 braked, zero at rest.
     """
 
     ahead: jax.Array
@@ -175,37 +165,27 @@ class Arc(NamedTuple):
     cos: jax.Array
 
 
-def slip(velocity_x: Scalar, rim_speed: Scalar, creep_speed: Scalar = 0.05) -> jax.Array:
-    """Slip `[...]` in [-1, 1]: 1 - v/(r w) driven, r w/v - 1 braked, zero at rest.
-
-    velocity_x, rim_speed (r w): m/s, signed; values and gradients are finite everywhere.
-    """
-    ahead = jnp.where(velocity_x + rim_speed >= 0, 1.0, -1.0)
-    faster = jnp.maximum(jnp.square(velocity_x), jnp.square(rim_speed))
-    s = ahead * (rim_speed - velocity_x) * jax.lax.rsqrt(faster + jnp.square(creep_speed))
-    return jnp.clip(s, -1.0, 1.0)
-
-
-def motion(
-    wheel: Wheel, creep_speed: Scalar, velocity_x: Scalar, velocity_y: Scalar, omega: Scalar
-) -> Motion:
-    """The motion of a wheel `[...]`, from hub velocities in m/s and spin in rad/s."""
+def travel(wheel: Wheel, creep_speed: Scalar, motion: Motion) -> Travel:
+    """The motion of a wheel `[...]`; values and gradients are finite everywhere."""
+    velocity_x, velocity_y, omega = motion
     rim = wheel.radius * omega
     both = velocity_x + rim
     ahead = jnp.where(both >= 0, 1.0, -1.0)
-    return Motion(
+    faster = jnp.maximum(jnp.square(velocity_x), jnp.square(rim))
+    slip = ahead * (rim - velocity_x) * jax.lax.rsqrt(faster + jnp.square(creep_speed))
+    return Travel(
         ahead=ahead,
         hub=ahead * velocity_x,
         rim=ahead * rim,
         lateral=jnp.asarray(velocity_y),
         spin=jnp.sqrt(jnp.square(omega) + (creep_speed / wheel.radius) ** 2),
         rolling=jnp.abs(both) * jax.lax.rsqrt(both**2 + creep_speed**2),
-        slip=slip(velocity_x, rim, creep_speed),
+        slip=jnp.clip(slip, -1.0, 1.0),
     )
 
 
 def patch(
-    contact: BekkerWongParams, friction_angle: jax.Array, depth: jax.Array, m: Motion
+    contact: BekkerWongParams, friction_angle: jax.Array, depth: jax.Array, m: Travel
 ) -> Patch:
     """Where a wheel touches soil at `depth`, in wheel radii."""
     driven, braked = jnp.maximum(m.slip, 0.0), jnp.maximum(-m.slip, 0.0)
@@ -226,7 +206,7 @@ def patch(
     return Patch(entry, peak, jnp.minimum(leave, peak), reversal)
 
 
-def breaks(p: Patch, m: Motion) -> tuple[jax.Array, ...]:
+def breaks(p: Patch, m: Travel) -> tuple[jax.Array, ...]:
     """Angles from exit to entry, `PANELS + 1` of them, between which the stresses are smooth.
 
     Beside the peak they are, under a skidding wheel, the reversal of the flow of soil and the
@@ -306,7 +286,7 @@ def normal_stress(
 
 
 def shear_stress(
-    soil: Soil, contact: BekkerWongParams, p: Patch, m: Motion, at: Arc, sigma: jax.Array
+    soil: Soil, contact: BekkerWongParams, p: Patch, m: Travel, at: Arc, sigma: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Janosi-Hanamoto shear in Pa on the wheel: along the rim, forwards, and to the left."""
     mean = _mean_cosine(p)  # ahead of th0 the soil is pushed along with it
@@ -332,7 +312,7 @@ def shear_stress(
 
 
 def bulldozing(
-    soil: Soil, contact: BekkerWongParams, radius: Scalar, p: Patch, m: Motion, at: Arc
+    soil: Soil, contact: BekkerWongParams, radius: Scalar, p: Patch, m: Travel, at: Arc
 ) -> jax.Array:
     """Side force per angle and wheel radius, N/(rad m), of the soil the wheel's flank pushes."""
     sin_slip_angle = -m.lateral * jax.lax.rsqrt(m.hub**2 + m.lateral**2 + contact.creep_speed**2)

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax.mechanics.wheel import MAX_SINKAGE, Scalar, SoilContact, Wheel
+from vertiwm_jax.mechanics.wheel import MAX_SINKAGE, Motion, Scalar, SoilContact, Wheel
 from vertiwm_jax.terrain.soil import Soil
 
 _BISECTIONS = 26  # of 1.5 radii: past the last bit of float32
@@ -14,9 +14,7 @@ def equilibrium_sinkage(
     soil: Soil,
     contact: SoilContact,
     load: Scalar,
-    velocity_x: Scalar,
-    velocity_y: Scalar,
-    omega: Scalar,
+    motion: Motion,
     rut: Scalar = 0.0,
     nodes: int = 6,
 ) -> jax.Array:
@@ -28,8 +26,7 @@ def equilibrium_sinkage(
     """
 
     def unbalanced(sinkage: jax.Array) -> jax.Array:
-        motion = velocity_x, velocity_y, omega
-        return contact.forces(wheel, soil, sinkage, *motion, rut, nodes).normal - load
+        return contact.forces(wheel, soil, sinkage, motion, rut, nodes).normal - load
 
     def bisect(residual, low: jax.Array) -> jax.Array:
         def halve(_, bracket: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

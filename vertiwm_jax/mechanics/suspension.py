@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from vertiwm_jax.mechanics.contact import GroundContact, tangents
 from vertiwm_jax.mechanics.newton_euler import ContactForce, DampedForce, Twist, velocity_at
 from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle
-from vertiwm_jax.mechanics.wheel import SoilContact, Wheel, WheelForces, rigid_forces
+from vertiwm_jax.mechanics.wheel import Motion, SoilContact, Wheel, WheelForces, rigid_forces
 from vertiwm_jax.terrain.soil import Soil
 from vertiwm_jax.vector import Vector
 
@@ -82,18 +82,18 @@ def support(
     wheels: GroundContact,
     press: WheelSupport,
     sinkage: jax.Array,
-    motion: tuple[jax.Array, jax.Array, jax.Array],
+    motion: Motion,
     rut: jax.Array,
 ) -> tuple[WheelForces, jax.Array, jax.Array, jax.Array]:
     """Forces on the wheels, new sinkage m, load N and its stiffness N/m, all `[4]`.
 
-    sinkage: m, so far. motion: of the wheels ahead and to the left, m/s, and their spin, rad/s.
+    sinkage: m, so far.
 
     Soil and suspension share the depth: one Newton step a sub-step towards the sinkage at which
     their forces agree. Rigid ground leaves all of it to the suspension.
     """
     wheel = Wheel(vehicle.wheel_radius, vehicle.wheel_width)
-    in_soil = contact.forces(wheel, soil, sinkage, *motion, rut, QUADRATURE_NODES)
+    in_soil = contact.forces(wheel, soil, sinkage, motion, rut, QUADRATURE_NODES)
     # Normal force grows about like sinkage to the power n + 1/2 (Bekker, wheel on flat ground).
     sunk = jnp.maximum(sinkage - rut, LEAST_SINKAGE)
     yielding = (soil.n + 0.5) * in_soil.normal / sunk
@@ -105,7 +105,7 @@ def support(
     rate = press.stiffness * jnp.where(wheels.soft, yielding / together, 1.0)
 
     friction = jnp.minimum(wheels.friction, vehicle.tyre_friction)
-    on_rock = rigid_forces(wheel, friction, load, *motion, ADHESION_SPEED)
+    on_rock = rigid_forces(wheel, friction, load, motion, ADHESION_SPEED)
     # Soil shears under the load that is really on it, whatever the sinkage says for now.
     loaded = jnp.minimum(load / jnp.maximum(in_soil.normal, 1.0), 1.0)
     ground = jax.tree.map(lambda a, b: jnp.where(wheels.soft, loaded * a, b), in_soil, on_rock)
