@@ -248,7 +248,7 @@ def trained(bench: Benchmark) -> Found:
     """In a process of its own that finds nothing compiled before, and when it said what."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "ppo.yaml"
-        configuration.save(replace(bench.config, operands="auto", runs=Path(folder)), file)
+        configuration.save(replace(bench.config, compute_dtype="auto", runs=Path(folder)), file)
         command = [sys.executable, "-m", "vertiwm_jax.ppo", "--config", str(file)]
         # This process has three quarters of the device's memory.
         given = os.environ | {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.2"}
@@ -357,7 +357,7 @@ def machine(device: jax.Device) -> Found:
 def sizes(small: bool) -> tuple[PPOTraining, Sequence[ModelName], Sequence[int], Sequence[int]]:
     """The training, models, and numbers of vehicles and of environments."""
     config = configuration.load(PPOTraining, configuration.default_config("ppo"))
-    config = replace(config, operands="float32")
+    config = replace(config, compute_dtype="float32")
     if not small:
         numbers = (256, 1024, 4096, 16_384)
         return config, get_args(ModelName), (*numbers, 65_536), numbers

@@ -25,11 +25,11 @@ from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models import files
 from vertiwm_jax.models.config import Size
 from vertiwm_jax.models.registry import ModelName
+from vertiwm_jax.networks.specialist import ComputeDtype
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
 from vertiwm_jax.rl.ppo import PPO
 from vertiwm_jax.training import Seeds
-from vertiwm_jax.world_model.network import ComputeDtype
 
 
 @struct.dataclass
@@ -69,11 +69,11 @@ def iteration(ppo: PPO, params: Any) -> Figures:
     return results
 
 
-def of_task(name: str, model: ModelName, weights: Path | None, operands: ComputeDtype) -> Figures:
+def of_task(name: str, model: ModelName, weights: Path | None, dtype: ComputeDtype) -> Figures:
     """An iteration of the training that the configuration `name` describes, inside a model."""
     file = configuration.default_config(name)
     config = configuration.load(PPOTraining, file)
-    config = replace(config, model=model, weights=weights, operands=operands)
+    config = replace(config, model=model, weights=weights, compute_dtype=dtype)
     training, _ = experiment.training_environment(config)
     return iteration(config.algorithm(training.env), training.params)
 
@@ -84,7 +84,7 @@ def main() -> None:
     arguments.add_argument("--models", nargs="+", default=("builtin", "vertiwm"))
     arguments.add_argument("--size", choices=get_args(Size), default="base", help="of Verti-WM")
     arguments.add_argument(
-        "--operands",
+        "--compute-dtype",
         nargs="+",
         choices=get_args(ComputeDtype),
         default=("float32",),
@@ -101,9 +101,9 @@ def main() -> None:
             files.save(weights, PAPER, params)
         for name in chosen.configs:
             for model in chosen.models:
-                for operands in chosen.operands:
-                    row = of_task(name, model, weights, operands)
-                    results[f"{name}, {model}, {operands}"] = row
+                for dtype in chosen.compute_dtype:
+                    row = of_task(name, model, weights, dtype)
+                    results[f"{name}, {model}, {dtype}"] = row
     report("ppo_throughput", results, chosen.json)
 
 

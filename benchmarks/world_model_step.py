@@ -18,9 +18,9 @@ from benchmarks._harness import Figures, measure, parser, report
 from benchmarks.models import drives, untrained
 from vertiwm_jax.models.config import Size
 from vertiwm_jax.models.registry import load_model
+from vertiwm_jax.networks.specialist import ComputeDtype
 from vertiwm_jax.perception.perceive import perceive
 from vertiwm_jax.world_model import fusion, motion
-from vertiwm_jax.world_model.network import ComputeDtype
 from vertiwm_jax.world_model.verti_wm import VertiWM
 
 Part = tuple[Callable[..., Any], tuple[Any, ...]]
@@ -99,7 +99,7 @@ def ceilings() -> dict[str, float]:
     """FLOP/s of matmuls and bytes/s of a sum of large arrays, on this machine, now."""
     ab = jax.random.normal(jax.random.key(0), (2, 1024, 1024))
     matmul = jax.jit(partial(jnp.matmul, preferred_element_type=jnp.float32))
-    single, half = (measure(matmul, *ab.astype(operands)) for operands in get_args(ComputeDtype))
+    single, half = (measure(matmul, *ab.astype(dtype)) for dtype in get_args(ComputeDtype))
     x, y = jnp.ones((2, 1 << 24))
     sums = jax.jit(lambda x, y: jax.lax.fori_loop(0, _SUMS, lambda _, x: x + y, x))
     moved = 3 * _SUMS * x.nbytes

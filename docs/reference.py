@@ -45,7 +45,6 @@ PUBLIC = {
         "TerrainMap",
         "load_map",
         "make_worlds",
-        "terrain.files.from_heightmap",
         "terrain.files.save",
         "terrain.map.stack",
         "terrain.worlds.WorldConfig",

@@ -46,7 +46,7 @@ class Vector(NamedTuple):
             self.x * other.y - self.y * other.x,
         )
 
-    def normalised(self) -> "Vector":
+    def normalized(self) -> "Vector":
         """Unit length; the vector must not be zero."""
         return self.times(jax.lax.rsqrt(self.dot(self)))
 

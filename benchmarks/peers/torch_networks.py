@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from benchmarks.peers.torch_query import tensor
+from vertiwm_jax.networks.specialist import WINDOW, NetworkSize
 from vertiwm_jax.terrain.patches import CELL_PIXELS
-from vertiwm_jax.world_model.network import WINDOW, NetworkSize
 
 Weights = Mapping[str, Any]
 """What flax calls the parameters of a module."""
@@ -87,7 +87,7 @@ class Block(nn.Module):
 
 
 class SpecialistNetwork(nn.Module):
-    """`world_model.SpecialistNetwork`, one token at a time."""
+    """`networks.specialist.SpecialistNetwork`, one token at a time."""
 
     cos: Tensor
     sin: Tensor

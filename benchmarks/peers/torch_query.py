@@ -14,7 +14,7 @@ from torch import Tensor
 
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.terrain.patches import PATCH_METRES, PATCH_PIXELS, RELIEF_METRES
+from vertiwm_jax.terrain.patches import PATCH_METERS, PATCH_PIXELS, RELIEF_METERS
 
 SOIL = ("kc", "kphi", "n", "cohesion", "friction_angle", "shear_modulus")
 """Columns of a soil, named as in `terrain.soil.Soil`."""
@@ -93,7 +93,7 @@ def patches(ground: Ground, state: Tensor) -> tuple[Tensor, Tensor]:
     Row 0 is farthest ahead, column 0 farthest left; both in [-1, 1].
     """
     cos, sin = torch.cos(state[:, 5, None, None]), torch.sin(state[:, 5, None, None])
-    across, down = (PATCH_METRES / ground.extent).unbind()
+    across, down = (PATCH_METERS / ground.extent).unbind()
     x, y = (2 * (state[:, :2] - ground.origin) / ground.extent)[..., None, None].unbind(1)
     # Sums of a row and a column, in two planes: affine_grid takes several times as long.
     u, v = _PLACES, _PLACES[:, None]
@@ -106,7 +106,7 @@ def patches(ground: Ground, state: Tensor) -> tuple[Tensor, Tensor]:
     colours = F.grid_sample(
         ground.colours, grid, mode="nearest", padding_mode="border", align_corners=False
     )
-    elevation = (heights - state[:, 2, None, None, None]) / RELIEF_METRES
+    elevation = (heights - state[:, 2, None, None, None]) / RELIEF_METERS
     return elevation.clamp(-1, 1), colours
 
 

@@ -225,7 +225,7 @@ def test_step_compiles_once_and_resets_by_itself():
 @pytest.mark.parametrize("name", get_args(ModelName))
 @pytest.mark.integration
 def test_a_model_is_traced_once_for_starts_and_for_steps(name, monkeypatch):
-    model, params = task_of_learning.dynamics(TaskConfig(operands="float32"), name)
+    model, params = task_of_learning.dynamics(TaskConfig(compute_dtype="float32"), name)
     traced, step = [], type(model).step
 
     def noted(self, *args):
@@ -266,12 +266,6 @@ def test_worlds_are_not_copied_per_vehicle():
 def test_equal_environments_are_one_static_argument():
     assert NavigationEnv(KinematicBicycle()) == NavigationEnv(KinematicBicycle())
     assert hash(NavigationEnv(KinematicBicycle())) == hash(NavigationEnv(KinematicBicycle()))
-
-
-def test_a_patch_must_cover_the_next_footprint():
-    with pytest.raises(ValueError, match="top speed"):
-        config = NavigationConfig(speed_range=(0.0, 60.0))
-        bicycle_env(ground(), task((0.0, 0.0), (30.0, 0.0)), config)
 
 
 def test_a_model_that_cannot_stand_is_named():

@@ -34,6 +34,7 @@ from vertiwm_jax.learning.fitting import Fit, FitInputs, Problem, merge
 from vertiwm_jax.learning.stages import Inputs
 from vertiwm_jax.models import files
 from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
+from vertiwm_jax.networks.specialist import ComputeDtype
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.perception.perceive import perceive
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
@@ -44,7 +45,6 @@ from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import worlds
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import BOUNDS
-from vertiwm_jax.world_model.network import ComputeDtype
 
 Numbers = dict[str, Any]
 

@@ -319,7 +319,7 @@ def test_training_inside_a_world_model_and_judged_in_the_simulator(
     expected = "training in vertiwm on 2 worlds, multiplying bfloat16"
     assert expected in capsys.readouterr().out
     # It goes on with what it began with, wherever that is.
-    assert configuration.load(PPOTraining, run / "config.yaml").operands == "bfloat16"
+    assert configuration.load(PPOTraining, run / "config.yaml").compute_dtype == "bfloat16"
     assert all(np.isfinite(line["policy_loss"]) for line in runs.read_metrics(run))
     door("evaluate")(["navigation", "--policy", str(run)])
     assert (run / "summary.md").read_text() in capsys.readouterr().out

@@ -122,7 +122,7 @@ def test_agrees_with_adaptive_quadrature():
     "contact",
     [
         BekkerWongParams(rebound=0.9, slip_sinkage=0.2, skid_sinkage=0.3),
-        BekkerWongParams(reversal="rankine", bulldozing="wong"),
+        BekkerWongParams(bulldozing="wong"),
     ],
 )
 @pytest.mark.integration

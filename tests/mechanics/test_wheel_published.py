@@ -4,7 +4,6 @@ import jax
 import numpy as np
 import pytest
 
-from vertiwm_jax.mechanics import bekker_wong
 from vertiwm_jax.mechanics.bekker_wong import LOOSE_SAND, BekkerWongParams
 from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
 from vertiwm_jax.mechanics.wheel import Wheel
@@ -54,24 +53,6 @@ def test_driven_wheel_on_sand(soil, width, load, peak, slip, angle, sinkage, dra
     got = [z / INCH, f.longitudinal / POUND, f.torque / POUND / INCH, f.normal / POUND]
     np.testing.assert_allclose(got, [sinkage, drawbar, torque, load], rtol=1e-3)
     np.testing.assert_allclose(entry_angle(z, 24.7 * INCH), angle, rtol=1e-3)
-
-
-def test_towed_wheel_on_compact_sand():
-    contact = BekkerWongParams(peak=0.43, peak_slip=0.32, reversal="rankine", **EXACT)
-    wheel = Wheel(24.7 * INCH, 6 * INCH)
-    skid = 0.216
-    z, f = settle(wheel, COMPACT, contact, 2006 * POUND, 10 * (1 + skid), 0.0, 10.0)
-    np.testing.assert_allclose(entry_angle(z, 24.7 * INCH), 37.670, rtol=1e-3)
-    np.testing.assert_allclose(-f.longitudinal / POUND, 729.5, rtol=1e-3)
-
-
-def test_reversal_of_a_towed_wheel():
-    wheel = Wheel(24.7 * INCH, 6 * INCH)
-    contact = BekkerWongParams(reversal="rankine", **EXACT)
-    motion = 12.16, np.float32(0), np.float32(10 / wheel.radius)
-    travel = bekker_wong.travel(wheel, 1e-4, motion)
-    patch = bekker_wong.patch(contact, COMPACT.friction_angle, np.float32(5.149 / 24.7), travel)
-    np.testing.assert_allclose(np.rad2deg(patch.reversal), 15.286, rtol=1e-3)
 
 
 @pytest.mark.parametrize(

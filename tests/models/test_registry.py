@@ -14,8 +14,8 @@ from vertiwm_jax.dynamics import embedding, rollout
 from vertiwm_jax.models import files
 from vertiwm_jax.models.config import ModelConfig, with_soil
 from vertiwm_jax.models.registry import load_fitted, load_model
+from vertiwm_jax.networks.specialist import cast_weights
 from vertiwm_jax.world_model.nesam import Nesam
-from vertiwm_jax.world_model.network import cast_weights
 
 TERRAIN, STATES, COMMANDS = rough(), driving(3, 5), commands(8)
 LEARNED = ("vertiwm", "transformer", "nesam")

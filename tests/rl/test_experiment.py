@@ -40,8 +40,8 @@ def test_a_rover_is_tested_on_soil_of_its_scale():
 )
 def test_models_multiply_what_is_asked_or_faster(asked, faster, found, monkeypatch):
     monkeypatch.setattr(machine, "multiplies_bfloat16", lambda: faster)
-    chosen = TaskConfig(operands=asked)
-    assert chosen.multiplied == found
+    chosen = TaskConfig(compute_dtype=asked)
+    assert chosen.fixed_dtype == found
     _, params = experiment.dynamics(chosen, "nesam")
     half = any(leaf.dtype == jnp.bfloat16 for leaf in jax.tree.leaves(params))
     assert half == (found == "bfloat16")

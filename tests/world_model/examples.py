@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertiwm_jax.networks.specialist import NetworkSize
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.network import NetworkSize
 from vertiwm_jax.world_model.normalization import Normalization
 
 TINY = NetworkSize(layers=2, width=32, heads=2, hidden=48, channels=4)

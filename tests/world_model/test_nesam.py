@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from networks import sequences
 from world_model.examples import (
     CONSTANTS,
     TINY,
@@ -22,14 +23,14 @@ from vertiwm_jax.learning import augment, calibration
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import load_vehicle
+from vertiwm_jax.networks.specialist import BASE, WINDOW
 from vertiwm_jax.perception.features import init_pair, init_soil
 from vertiwm_jax.perception.perceive import perceive
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
-from vertiwm_jax.world_model import motion, nesam_inputs, network
+from vertiwm_jax.world_model import motion, nesam_inputs
 from vertiwm_jax.world_model.alone import Alone
 from vertiwm_jax.world_model.nesam import Nesam
-from vertiwm_jax.world_model.network import BASE, WINDOW
 from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
 KEY, TERRAIN = jax.random.key(0), rough()
@@ -143,8 +144,8 @@ def test_steps_along_a_drive_equal_the_whole_sequence():
         expected = jax.tree.map(lambda x, y: jnp.concatenate([x[:1], y[:-1]]), states, physics)
         constants = own.normalization, own.correction_scale, params.vehicle
         step = expected, states, commands, physics, memories
-        inputs = nesam_inputs.of(*constants, *step)
-        outputs = network._Module(TINY).apply(own.network, inputs, None)
+        inputs = nesam_inputs.StepFeatures.of(*constants, *step).both
+        outputs = sequences.specialist(own.network["params"], inputs, None, TINY, WINDOW)
         mean = 0.5 * (outputs[0] + nesam_inputs.MOTION_SIGNS * outputs[1])
         return physics, motion.corrected(physics, own.correction_scale * mean)
 

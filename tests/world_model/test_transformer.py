@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from networks import sequences
 from world_model.examples import (
     CONSTANTS,
     TINY,
@@ -19,12 +20,12 @@ from world_model.examples import (
 
 from vertiwm_jax.dynamics import along, rollout, warm_up
 from vertiwm_jax.mechanics.vehicle import load_vehicle
+from vertiwm_jax.networks.specialist import BASE, PAPER, WINDOW
 from vertiwm_jax.perception.features import init_pair, init_reduce
 from vertiwm_jax.perception.perceive import perceive
 from vertiwm_jax.state import Command, VehicleState
-from vertiwm_jax.world_model import motion, network
+from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.alone import Alone
-from vertiwm_jax.world_model.network import BASE, PAPER, WINDOW
 from vertiwm_jax.world_model.transformer import Transformer
 from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
@@ -92,7 +93,7 @@ def test_steps_along_a_drive_equal_the_whole_sequence(kind):
         seen = jax.vmap(lambda state: perceive(params.encoders, TERRAIN, state))(states)
         below = model.specialist._ground(TERRAIN, seen[0], states)
         inputs = constants.inputs(states, commands)
-        output = network._Module(TINY).apply(own.network, inputs, below)
+        output = sequences.specialist(own.network["params"], inputs, below, TINY, WINDOW)
         return motion.advance(states, constants.transition(output))
 
     expected = at_once(params, drive, control)

@@ -136,7 +136,7 @@ def _train(row: Row, settings: TrainConfig, folder: Path) -> Path:
         return begun
     if begun:
         kept = configuration.load(type(settings), begun / "config.yaml")
-        settings = replace(settings, operands=kept.operands)
+        settings = replace(settings, compute_dtype=kept.compute_dtype)
     trained = experiment.run(replace(settings, runs=place, resume=begun))
     _log.info("\n%s\n", report.after_training(trained))
     return trained.folder

@@ -16,7 +16,7 @@ from vertiwm_jax.networks.encoder import TerrainAutoencoder, TerrainEncoder
 from vertiwm_jax.networks.soil_predictor import SoilPredictor
 from vertiwm_jax.terrain import patches, query
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.terrain.patches import PATCH_PIXELS, RELIEF_METRES, Patches
+from vertiwm_jax.terrain.patches import PATCH_PIXELS, RELIEF_METERS, Patches
 from vertiwm_jax.terrain.soil import BOUNDS, Soil, to_unit
 
 _ELEVATION, _SEMANTIC = TerrainAutoencoder(1), TerrainAutoencoder(3)
@@ -106,7 +106,7 @@ class AutoencoderProblem:
         found = errors(params, data.validation_terrain, data.validation)
         elevation, color, accuracy = map(jnp.mean, found)
         return {
-            "elevation_rms": RELIEF_METRES * jnp.sqrt(elevation),
+            "elevation_rms": RELIEF_METERS * jnp.sqrt(elevation),
             "colour_accuracy": accuracy,
             "error": elevation + color,
         }

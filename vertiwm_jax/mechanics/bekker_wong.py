@@ -45,12 +45,9 @@ class BekkerWongParams:
     exit, exit_slip: th2 = (exit + exit_slip max(s, 0)) th1.
     rebound: lam of th2 = -acos(1 - lam h / r), added to the former (Ishigami 2007).
     slip_sinkage, skid_sinkage: n = n0 + slip_sinkage s driven, n0 - skid_sinkage s braked.
-    unload_stiffness, unload_slope: k0 in Pa/m and A_u in Pa/m2 of Wong's unloading and reloading
-        p = p_u - (k0 + A_u z_u)(z_u - z); stiff enough to be felt in a rut only.
+    unload_stiffness: k0 in Pa/m of Wong's unloading and reloading p = p_u - k0 (z_u - z); stiff
+        enough to be felt in a rut only.
     creep_speed: m/s below which shear fades out, so that a standing wheel has smooth forces.
-    reversal: th0 of a skidding wheel. "linear": th1 (1 + s/2), shear along the slip velocity
-        (Pavlov 2024), continuous from driving to braking. "rankine": from the friction angle,
-        the stress peak there too, shear along the displacement (Wong and Reece 1967, towed).
     bulldozing: pressure on the wheel's side, "ishigami" (2007) or "wong" (2008).
     """
 
@@ -62,9 +59,7 @@ class BekkerWongParams:
     slip_sinkage: Scalar = 0.0
     skid_sinkage: Scalar = 0.0
     unload_stiffness: Scalar = 2e8
-    unload_slope: Scalar = 0.0
     creep_speed: Scalar = 0.05
-    reversal: Literal["linear", "rankine"] = struct.field(pytree_node=False, default="linear")
     bulldozing: Literal["ishigami", "wong"] = struct.field(pytree_node=False, default="ishigami")
 
     def forces(
@@ -93,7 +88,7 @@ class BekkerWongParams:
         floor, unload = reloading(contact, keq, n, rut)
 
         depth, touching = depth_below(floor, sinkage, wheel)
-        p = patch(contact, soil.friction_angle, depth, m)
+        p = patch(contact, depth, m)
         starts = jnp.stack(breaks(p, m))
         extents = jnp.diff(starts, axis=0)
 
@@ -101,7 +96,8 @@ class BekkerWongParams:
             panel: jax.Array, point: jax.Array, weight: jax.Array
         ) -> tuple[jax.Array, Arrays]:
             extent = extents[panel]
-            at = arc(p, starts[panel] + point * extent)
+            angle = starts[panel] + point * extent
+            at = Arc(angle, *sin_cos(angle))
             z = wheel.radius * pressing_depth(p, at.angle)
             sigma = normal_stress(keq, n, unload, floor, z)
             tau_x, tau_y = shear_stress(soil, contact, p, m, at, sigma)
@@ -184,22 +180,13 @@ def travel(wheel: Wheel, creep_speed: Scalar, motion: Motion) -> Travel:
     )
 
 
-def patch(
-    contact: BekkerWongParams, friction_angle: jax.Array, depth: jax.Array, m: Travel
-) -> Patch:
+def patch(contact: BekkerWongParams, depth: jax.Array, m: Travel) -> Patch:
     """Where a wheel touches soil at `depth`, in wheel radii."""
     driven, braked = jnp.maximum(m.slip, 0.0), jnp.maximum(-m.slip, 0.0)
     entry = contact_angle(depth)
     peak = (contact.peak + contact.peak_slip * driven) * entry
+    # Pavlov (2024): continuous from driving to braking.
     reversal = (1 - braked / 2) * entry
-    if contact.reversal == "rankine":
-        # cos(th0) - tan(a) sin(th0) = r w / v with a = 45 deg - phi/2, solved for th0.
-        a = jnp.pi / 4 - friction_angle / 2
-        skid = braked > 0
-        ratio = jnp.clip(jnp.where(skid, m.rim / jnp.where(skid, m.hub, 1.0), 0.0), 0.0, 1.0)
-        towed = jnp.arccos(ratio * jnp.cos(a)) - a
-        reversal = jnp.where(skid, jnp.minimum(towed, _MAX_PEAK * entry), entry)
-        peak = jnp.where(skid, reversal, peak)
     peak = jnp.minimum(peak, _MAX_PEAK * entry)
     rebound = contact_angle(contact.rebound * depth)
     leave = (contact.exit + contact.exit_slip * driven) * entry - rebound
@@ -236,17 +223,6 @@ def _mean_cosine(p: Patch) -> jax.Array:
     return jnp.cos((p.entry + p.reversal) / 2) * jnp.sinc(half / jnp.pi)
 
 
-def arc(p: Patch, angle: jax.Array) -> Arc:
-    """The point of the rim at `angle` rad."""
-    sin_a, cos_a = sin_cos((p.entry - angle) / 2)
-    sin_entry, cos_entry = jnp.sin(p.entry), jnp.cos(p.entry)
-    return Arc(
-        angle,
-        sin_entry - 2 * sin_a * (cos_entry * cos_a + sin_entry * sin_a),
-        cos_entry + 2 * sin_a * (sin_entry * cos_a - cos_entry * sin_a),
-    )
-
-
 def pressing_depth(p: Patch, angle: jax.Array) -> jax.Array:
     """Depth in radii whose pressure acts at `angle`: cos th - cos th1, mirrored behind thm."""
     behind = p.peak - p.exit
@@ -269,8 +245,7 @@ def reloading(
     deepest = jnp.where(compacted, rut, 1.0)
     pressure = keq * jnp.exp(n * jnp.log(deepest))
     # Rebound never lifts the floor above the undisturbed surface.
-    stiffness = contact.unload_stiffness + contact.unload_slope * deepest
-    stiffness = jnp.maximum(stiffness, pressure / deepest)
+    stiffness = jnp.maximum(contact.unload_stiffness, pressure / deepest)
     # Rounding must not lift it either: a negative depth has no power.
     floor = jnp.where(compacted, jnp.maximum(deepest - pressure / stiffness, 0.0), 0.0)
     return floor, jnp.where(compacted, stiffness, 1e15)
@@ -302,11 +277,8 @@ def shear_stress(
     path = jnp.sqrt(path_x**2 + path_y**2 + (1e-3 * creep) ** 2)
     strength = soil.cohesion + sigma * jnp.tan(soil.friction_angle)
     tau = strength * (1 - jnp.exp(-path / (soil.shear_modulus * m.spin)))
-    if contact.reversal == "rankine":
-        along, across = path_x, path_y
-    else:
-        along = jnp.where(pushed, m.hub * (mean - at.cos), m.rim - m.hub * at.cos)
-        across = -m.lateral
+    along = jnp.where(pushed, m.hub * (mean - at.cos), m.rim - m.hub * at.cos)
+    across = -m.lateral
     tau = tau * jax.lax.rsqrt(along**2 + across**2 + creep**2)
     return tau * along, tau * across
 

@@ -15,7 +15,7 @@ from vertiwm_jax.vector import Axes, Vector
 TREAD_ANGLES = (-0.7, -0.35, 0.0, 0.35, 0.7)
 """Where both rims of a wheel are tested against the ground, rad from straight down."""
 SHARED_DEPTH = 0.005
-"""Depth, m, over which neighbouring points of a tread share a contact."""
+"""Depth, m, over which neighboring points of a tread share a contact."""
 LEAST_YIELD = 0.01
 """Depth, m, by which soil gives way at least before it carries beside rigid ground."""
 
@@ -63,7 +63,7 @@ def contacts(
 ) -> tuple[GroundContact, GroundContact]:
     """Contacts of the four wheels `[4]` and of the deepest hull point `[1]`, in one query.
 
-    travel: `[4]` m, height of the wheel centres in the body; steering: `[4]` rad; sinkage: `[4]`
+    travel: `[4]` m, height of the wheel centers in the body; steering: `[4]` rad; sinkage: `[4]`
     m, how deep the wheels are in soil already.
     """
     tread, hull = _tread(vehicle, travel, steering), Vector.of(vehicle.hull)
@@ -84,10 +84,7 @@ def contacts(
     deepest = count + jnp.argmax(samples.depth[count:])[None]
     on_hull = jax.tree.map(lambda x: x[deepest], samples)
     chassis = GroundContact(
-        point=on_hull.point,
-        normal=on_hull.normal,
-        depth=on_hull.depth,
-        friction=on_hull.friction,
+        *on_hull[:-1],
         soft=terrain.deformable[on_hull.semantic],
         soil=query.soil(terrain, on_hull.semantic),
         edge=jnp.zeros(1, bool),
@@ -98,7 +95,7 @@ def contacts(
 def tangents(normal: Vector, cos: jax.Array, sin: jax.Array) -> tuple[Vector, Vector]:
     """Directions in the tangent plane along and to the left of a heading in the body."""
     rise = normal.x * cos + normal.y * sin
-    along = Vector(cos - rise * normal.x, sin - rise * normal.y, -rise * normal.z).normalised()
+    along = Vector(cos - rise * normal.x, sin - rise * normal.y, -rise * normal.z).normalized()
     return along, normal.cross(along)
 
 
@@ -108,7 +105,7 @@ def _wheel_contacts(
     """One contact `[4]` of each wheel, shared by the points `[2 angles, 4]` that carry it.
 
     A wheel is a cylinder. Testing points on both rims, rather than the ground under the hub,
-    lets it roll over edges and stand on a rim; neighbouring points of like depth share the
+    lets it roll over edges and stand on a rim; neighboring points of like depth share the
     contact, so that it moves smoothly. It rests on either rigid ground or soil: soil carries only
     what has sunk into it, so rigid ground beside it is a step, whose edge pushes towards the axle.
     """
@@ -126,8 +123,8 @@ def _wheel_contacts(
     edge = ~in_soil & soft[lowest[0]] & soft[lowest[1]]
     # Along its own normal, the wheel is as much less deep in it as that is tilted.
     ahead, up = shared(np.sin(_RIM_ANGLES)), shared(np.cos(_RIM_ANGLES))
-    to_axle = Vector(-ahead * jnp.cos(steering), -ahead * jnp.sin(steering), up).normalised()
-    upright = Vector(*map(shared, tread.normal)).normalised()
+    to_axle = Vector(-ahead * jnp.cos(steering), -ahead * jnp.sin(steering), up).normalized()
+    upright = Vector(*map(shared, tread.normal)).normalized()
     # Of two soils that carry alike, that under the left rim.
     below = jnp.take_along_axis(tread.semantic, jnp.argmax(share, axis=0)[None], axis=0)[0]
     return GroundContact(

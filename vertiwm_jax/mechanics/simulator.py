@@ -7,7 +7,7 @@ their own: a wheel is where the ground, or the droop of its damper, puts it.
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -128,15 +128,9 @@ class Simulator:
             force=jnp.zeros((4, 3)).at[:, 0].set(load),
         )
 
-    def step(
-        self,
-        params: SimulatorParams,
-        terrain: TerrainMap,
-        history: SimulatorHistory,
-        state: VehicleState,
-        command: Command,
-    ) -> tuple[VehicleState, SimulatorHistory]:
-        return self.step_with_forces(params, terrain, history, state, command)[:2]
+    def step(self, *given: Any) -> tuple[VehicleState, SimulatorHistory]:
+        """The state 0.1 s later, and its history, of what `Dynamics.step` is given."""
+        return self.step_with_forces(*given)[:2]
 
     def step_with_forces(
         self,
@@ -222,13 +216,9 @@ def _substep(
     )
     on_hull = hull_contact(vehicle, body.twist, hull, centre, seconds)
     gravity = Vector(axes.x.z, axes.y.z, axes.z.z).times(-GRAVITY)
+    inertia_of_body = Vector.of(vehicle.inertia)
     twist = advance_twist(
-        body.twist,
-        vehicle.mass,
-        Vector.of(vehicle.inertia),
-        gravity,
-        [on_wheels, on_hull],
-        seconds,
+        body.twist, vehicle.mass, inertia_of_body, gravity, [on_wheels, on_hull], seconds
     )
 
     gained = velocity_at(twist, arm).plus(velocity, -1.0)
@@ -256,11 +246,7 @@ def _substep(
 
 def stiffened(params: SimulatorParams, soil: Soil) -> Soil:
     """The soil `[...]` that the wheels meet, of one of the map's."""
-    return replace(
-        soil,
-        kc=params.stiffening * soil.kc,
-        kphi=params.stiffening * soil.kphi,
-    )
+    return replace(soil, kc=params.stiffening * soil.kc, kphi=params.stiffening * soil.kphi)
 
 
 def _advance_pose(

@@ -7,10 +7,10 @@ import jax
 
 from vertiwm_jax.config import AtLeastOne, Count, settings
 from vertiwm_jax.mechanics.simulator import SimulatorParams
+from vertiwm_jax.networks.specialist import BASE, PAPER, NetworkSize
 from vertiwm_jax.perception.features import Encoders, init_pair, init_reduce, init_soil
 from vertiwm_jax.world_model.fusion import Coefficients, GateParams, GateTerrain
 from vertiwm_jax.world_model.nesam import Nesam
-from vertiwm_jax.world_model.network import BASE, PAPER, NetworkSize
 from vertiwm_jax.world_model.normalization import Normalization
 from vertiwm_jax.world_model.transformer import Ground, Transformer
 from vertiwm_jax.world_model.verti_wm import VertiWM, VertiWMParams

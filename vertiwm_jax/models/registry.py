@@ -11,9 +11,9 @@ from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
 from vertiwm_jax.models import files
 from vertiwm_jax.models.config import SoilSource, with_soil
+from vertiwm_jax.networks.specialist import ComputeDtype, cast_weights
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.world_model.alone import Alone
-from vertiwm_jax.world_model.network import ComputeDtype, cast_weights
 from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
 ModelName = Literal["builtin", "transformer", "nesam", "vertiwm"]

@@ -12,7 +12,8 @@ from flax import struct
 
 LOG_STD_BOUNDS = (-4.0, 1.0)
 """The range of the policy's log standard deviation, in units of half the action range."""
-_TILE = 4  # cells of a picture to a side
+_TILE = 4  # cells of an image to a side
+_INNER = nn.initializers.orthogonal(math.sqrt(2))
 
 
 @struct.dataclass
@@ -75,9 +76,9 @@ class MLP(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         """`[..., I]` features to `[..., outputs]`."""
         for width in self.hidden:
-            x = nn.tanh(nn.Dense(width, kernel_init=nn.initializers.orthogonal(math.sqrt(2)))(x))
-        kernel_init = nn.initializers.orthogonal(self.output_gain)
-        return nn.Dense(self.outputs, kernel_init=kernel_init)(x)
+            x = nn.tanh(nn.Dense(width, kernel_init=_INNER)(x))
+        outer = nn.initializers.orthogonal(self.output_gain)
+        return nn.Dense(self.outputs, kernel_init=outer)(x)
 
 
 @dataclass(frozen=True)
@@ -127,10 +128,10 @@ class ObservationLayout:
         return rest, ImageEncoder()(seen)
 
 
-def tiles(picture: jax.Array) -> jax.Array:
+def tiles(image: jax.Array) -> jax.Array:
     """Cuts `[..., h, w, c]` into tiles of 4 x 4, `[..., h w / 16, 16 c]`, row by row."""
-    *batch, h, w, c = picture.shape
-    split = picture.reshape(*batch, h // _TILE, _TILE, w // _TILE, _TILE, c)
+    *batch, h, w, c = image.shape
+    split = image.reshape(*batch, h // _TILE, _TILE, w // _TILE, _TILE, c)
     return jnp.swapaxes(split, -4, -3).reshape(*batch, -1, _TILE**2 * c)
 
 
@@ -144,9 +145,8 @@ class ImageEncoder(nn.Module):
     @nn.compact
     def __call__(self, seen: jax.Array) -> jax.Array:
         """`[..., T, F]` tiles to `[..., 16]` in [-1, 1]."""
-        kernel_init = nn.initializers.orthogonal(math.sqrt(2))
-        x = nn.tanh(nn.Dense(16, kernel_init=kernel_init)(seen))
-        return nn.tanh(nn.Dense(16, kernel_init=kernel_init)(x.reshape(*x.shape[:-2], -1)))
+        x = nn.tanh(nn.Dense(16, kernel_init=_INNER)(seen))
+        return nn.tanh(nn.Dense(16, kernel_init=_INNER)(x.reshape(*x.shape[:-2], -1)))
 
 
 class Attention(nn.Module):
@@ -168,12 +168,11 @@ class Attention(nn.Module):
         """
         seen, rest = self.candidates.split(observation)
         rest = jnp.concatenate([rest, compressed], axis=-1)
-        kernel_init = nn.initializers.orthogonal(math.sqrt(2))
         first, *more = self.hidden
-        context = nn.Dense(first, use_bias=False, kernel_init=kernel_init)(rest)
-        x = nn.tanh(nn.Dense(first, kernel_init=kernel_init)(seen) + context[..., None, :])
+        context = nn.Dense(first, use_bias=False, kernel_init=_INNER)(rest)
+        x = nn.tanh(nn.Dense(first, kernel_init=_INNER)(seen) + context[..., None, :])
         for width in more:
-            x = nn.tanh(nn.Dense(width, kernel_init=kernel_init)(x))
+            x = nn.tanh(nn.Dense(width, kernel_init=_INNER)(x))
         score = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))(x)
         share = nn.softmax(score, axis=-2)
         features = [jnp.sum(share * x, axis=-2), _largest(x), rest]
@@ -198,11 +197,9 @@ class Actor(nn.Module):
     def __call__(self, observation: jax.Array) -> Gaussian:
         features, attended, hidden = _look(observation, self.hidden, self.layout)
         mean = attended + MLP(hidden, self.actions, output_gain=0.01)(features)
-        low, high = LOG_STD_BOUNDS
-        share = (self.initial_log_std - low) / (high - low)
-        initial = nn.initializers.constant(math.log(share / (1 - share)))
+        initial = nn.initializers.constant(_raw(self.initial_log_std))
         raw = self.param("log_std", initial, (self.actions,))
-        return Gaussian(mean, low + (high - low) * nn.sigmoid(raw))
+        return Gaussian(mean, _log_std(raw))
 
 
 class Critic(nn.Module):
@@ -237,10 +234,7 @@ class TanhNormalActor(nn.Module):
             return TanhNormal(Gaussian(mean, jnp.full(self.actions, -jnp.inf)))
         outputs = MLP(hidden, 2 * self.actions, output_gain=0.01)(features)
         mean, raw = jnp.split(outputs, 2, axis=-1)
-        low, high = LOG_STD_BOUNDS
-        share = (self.initial_log_std - low) / (high - low)
-        log_std = low + (high - low) * nn.sigmoid(raw + math.log(share / (1 - share)))
-        return TanhNormal(Gaussian(attended + mean, log_std))
+        return TanhNormal(Gaussian(attended + mean, _log_std(raw + _raw(self.initial_log_std))))
 
 
 class ActionCritic(nn.Module):
@@ -262,6 +256,18 @@ def twin_values(
     """`[2, ...]` values of actions, by two critics whose weights are stacked."""
     values = jax.vmap(critic.apply, (0, None, None))(params, observation, action)
     return cast(jax.Array, values)
+
+
+def _log_std(raw: jax.Array) -> jax.Array:
+    """Any number to a log standard deviation within its bounds."""
+    low, high = LOG_STD_BOUNDS
+    return low + (high - low) * nn.sigmoid(raw)
+
+
+def _raw(log_std: float) -> float:
+    """The inverse of `_log_std`."""
+    low, high = LOG_STD_BOUNDS
+    return math.log((log_std - low) / (high - log_std))
 
 
 def _largest(x: jax.Array) -> jax.Array:

@@ -1,13 +1,12 @@
-"""A causal Transformer over a sliding window of tokens, whole sequences or one token a step.
+"""A causal Transformer over a sliding window of tokens, one token a step.
 
-The two ways give the same output: the mask is banded, so that a token sees the window that a
-cache would hold, and positions are rotary (Su et al., 2021, "RoFormer"), so that attention knows
-only how far apart two tokens are, wherever the cache keeps them.
+Positions are rotary (Su et al., 2021, "RoFormer"), so that attention knows only how far apart two
+tokens are, wherever the cache keeps them.
 """
 
 import math
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import flax.linen as nn
 import jax
@@ -46,6 +45,12 @@ class KeyValueCache:
     values: tuple[jax.Array, ...]
     age: jax.Array
 
+    @classmethod
+    def empty(cls, layers: int, shape: tuple[int, ...]) -> Self:
+        """The cache before the first token, with keys and values of `shape` in each layer."""
+        zeros = tuple(jnp.zeros(shape) for _ in range(layers))
+        return cls(zeros, zeros, jnp.zeros(shape[:-3], jnp.int32))
+
 
 class Transformer(nn.Module):
     """Pre-norm causal Transformer whose tokens attend to the `window` latest, themselves included.
@@ -75,39 +80,19 @@ class Transformer(nn.Module):
         ]
         self.norm = nn.RMSNorm()
 
-    def __call__(self, tokens: jax.Array) -> jax.Array:
-        """`[..., T, D]` whole sequences to `[..., T, D]`; the first token has no past."""
-        position = jnp.arange(tokens.shape[-2])
-        past = position[:, None] - position[None, :]
-        visible = (past >= 0) & (past < self.window)
-        turn = self._turn(position)
-        for block in self.blocks:
-            tokens = block(tokens, turn, visible)
-        return self.norm(tokens)
-
-    def step(self, token: jax.Array, cache: KeyValueCache) -> tuple[jax.Array, KeyValueCache]:
-        """`[..., D]` one token to `[..., D]` and the cache that holds it.
-
-        As the last token of `__call__` on all tokens since the cache was empty, to float32
-        accuracy.
-        """
+    def __call__(self, token: jax.Array, cache: KeyValueCache) -> tuple[jax.Array, KeyValueCache]:
+        """`[..., D]` one token to `[..., D]` and the cache that holds it."""
         turn = self._turn(cache.age[..., None])
         slot = cache.age % self.window
         visible = jnp.arange(self.window) <= cache.age[..., None]
         keys, values = [], []
         for block, key, value in zip(self.blocks, cache.keys, cache.values, strict=True):
-            token, key, value = block.step(token, key, value, turn, slot, visible)
+            token, key, value = block(token, key, value, turn, slot, visible)
             keys.append(key)
             values.append(value)
         age = cache.age + 1
         age = jnp.where(age < self._period + self.window, age, age - self._period)
         return self.norm(token), KeyValueCache(tuple(keys), tuple(values), age)
-
-    def empty_cache(self, batch: tuple[int, ...] = ()) -> KeyValueCache:
-        """The cache before the first token, with leading axes `batch`."""
-        shape = (*batch, self.heads, self.window, self.width // self.heads)
-        zeros = tuple(jnp.zeros(shape) for _ in range(self.layers))
-        return KeyValueCache(zeros, zeros, jnp.zeros(batch, jnp.int32))
 
     @property
     def _period(self) -> int:
@@ -151,18 +136,6 @@ class _Block(nn.Module):
         self.mlp_output = Dense(self.width, kernel_init=output)
 
     def __call__(
-        self, tokens: jax.Array, turn: tuple[jax.Array, jax.Array], visible: jax.Array
-    ) -> jax.Array:
-        """`[..., T, D]` to `[..., T, D]`; turn leaves `[T, d / 2]`; visible `[T, T]`."""
-        projected = self.query_key_value(self.attention_norm(tokens))
-        split = projected.reshape(*tokens.shape[:-1], 3, self.heads, -1)
-        query, key, value = jnp.moveaxis(split, (-3, -2), (0, -3))  # each [..., heads, T, d]
-        query, key = _rotate(query, turn), _rotate(key, turn)
-        scores = jnp.einsum("...hqd,...hkd->...hqk", query, key)
-        attended = jnp.einsum("...hqk,...hkd->...qhd", _weights(scores, visible, key), value)
-        return self._finish(tokens, attended)
-
-    def step(
         self,
         token: jax.Array,
         keys: jax.Array,
@@ -177,21 +150,12 @@ class _Block(nn.Module):
         query, key, value = jnp.moveaxis(split, -3, 0)  # each [..., heads, d]
         query, key = _rotate(query, turn), _rotate(key, turn)
         keys, values = _write(keys, key, slot), _write(values, value, slot)
-        scores = jnp.einsum("...hd,...hkd->...hk", query, keys)
-        weights = _weights(scores, visible[..., None, :], keys)
+        scores = jnp.einsum("...hd,...hkd->...hk", query, keys) / math.sqrt(keys.shape[-1])
+        weights = jax.nn.softmax(jnp.where(visible[..., None, :], scores, _MASKED), axis=-1)
         attended = jnp.einsum("...hk,...hkd->...hd", weights, values)
-        return self._finish(token, attended), keys, values
-
-    def _finish(self, tokens: jax.Array, attended: jax.Array) -> jax.Array:
-        """Tokens `[..., D]` and what their heads gathered `[..., heads, d]` to `[..., D]`."""
-        tokens = tokens + self.attention_output(attended.reshape(tokens.shape))
-        return tokens + self.mlp_output(nn.silu(self.mlp_hidden(self.mlp_norm(tokens))))
-
-
-def _weights(scores: jax.Array, visible: jax.Array, keys: jax.Array) -> jax.Array:
-    """Scores `[..., K]` of keys `[..., K, d]` to attention weights; 0 where not visible."""
-    scaled = scores / math.sqrt(keys.shape[-1])
-    return jax.nn.softmax(jnp.where(visible, scaled, _MASKED), axis=-1)
+        token = token + self.attention_output(attended.reshape(token.shape))
+        token = token + self.mlp_output(nn.silu(self.mlp_hidden(self.mlp_norm(token))))
+        return token, keys, values
 
 
 def _rotate(vectors: jax.Array, turn: tuple[jax.Array, jax.Array]) -> jax.Array:

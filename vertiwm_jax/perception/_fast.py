@@ -24,7 +24,7 @@ from vertiwm_jax.perception.features import Encoders, TerrainFeatures, features
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import _raster, patches
 from vertiwm_jax.terrain.map import ObservedMap, TerrainMap
-from vertiwm_jax.terrain.patches import CELL_PIXELS, RELIEF_METRES
+from vertiwm_jax.terrain.patches import CELL_PIXELS, RELIEF_METERS
 
 Shared = tuple[tuple[Encoders, ...], TerrainMap]
 """What all vehicles of a batch have in common: weights, and a map without what is not seen."""
@@ -84,17 +84,13 @@ def _batched(latents: bool) -> Callable[[Shared, _Vehicles], tuple[TerrainFeatur
             vehicles,
             batched[1],
         )
-        leaves, structure = jax.tree.flatten(shared)
-        is_own = jax.tree.leaves(batched[0])
-        if any(is_own):  # Several models or maps go one after the other.
+        if any(jax.tree.leaves(batched[0])):  # Several models or maps go one after the other.
 
-            def one(given: tuple[list[jax.Array], _Vehicles]) -> tuple[TerrainFeatures, ...]:
-                own, both = iter(given[0]), zip(leaves, is_own, strict=True)
-                mixed = [next(own) if of_each else x for x, of_each in both]
-                return of_all(jax.tree.unflatten(structure, mixed), given[1])
+            def one(i: jax.Array) -> tuple[TerrainFeatures, ...]:
+                own = jax.tree.map(lambda x, of_each: x[i] if of_each else x, shared, batched[0])
+                return of_all(own, jax.tree.map(lambda x: x[i], vehicles))
 
-            own = [x for x, of_each in zip(leaves, is_own, strict=True) if of_each]
-            found = jax.lax.map(one, (own, vehicles))
+            found = jax.lax.map(one, jnp.arange(size))
         else:
             merged = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), vehicles)
             found = of_all(shared, merged)
@@ -215,7 +211,7 @@ def _is_coarse(terrain: TerrainMap) -> jax.Array:
     """`[]` whether no cell, however turned, reaches beyond 3 x 3 vertices or 2 x 2 classes."""
     vertices, classes = np.array(terrain.elevation.shape[1:]), np.array(terrain.semantic.shape[1:])
     spacing = float(np.min(np.append((vertices - 1) / classes, 1.0)))  # in units of the resolution
-    widest = np.sqrt(2) * (CELL_PIXELS - 1) * patches.PIXEL_METRES
+    widest = np.sqrt(2) * (CELL_PIXELS - 1) * patches.PIXEL_METERS
     return spacing * terrain.resolution > widest
 
 
@@ -237,7 +233,7 @@ def _read_heights(
     first = jnp.minimum(_first(middles, around, last).astype(jnp.int32), last - 2)
     vertices = _raster.flat_index(terrain, rows, columns, first[1], first[0])[:, None]
     vertices += (columns * np.arange(3)[:, None] + np.arange(3)).ravel()
-    heights = (_raster.gather(terrain.elevation, vertices) - height) / RELIEF_METRES
+    heights = (_raster.gather(terrain.elevation, vertices) - height) / RELIEF_METERS
     surface = jnp.dot(heights, _HINGES, precision="highest")
     return surface, middles - first, jnp.float32(-first), jnp.float32(last - first)
 

@@ -22,6 +22,7 @@ from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
 from vertiwm_jax.models.registry import Imagined, ModelName, load_encoders, load_model
+from vertiwm_jax.networks.specialist import ComputeDtype
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.planning.improvement import ImprovementConfig, PolicyImprovement
 from vertiwm_jax.rl import policy
@@ -33,7 +34,6 @@ from vertiwm_jax.rl.td3 import TD3, TD3Config
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.training import LoopConfig, Seeds, Work, keep_compiled
-from vertiwm_jax.world_model.network import ComputeDtype
 
 Rows = dict[str, Policy | Agent]
 """Policies by their names in tables."""
@@ -44,7 +44,10 @@ _log = logging.getLogger(__name__)
 class TaskConfig:
     """What is driven, where, and with what."""
 
-    GONE: ClassVar[dict[str, str]] = {"worlds": "is now terrain"}
+    GONE: ClassVar[dict[str, str]] = {
+        "worlds": "is now terrain",
+        "operands": "is now compute_dtype",
+    }
 
     seed: int = 0
     """Decides everything that is random."""
@@ -63,10 +66,10 @@ class TaskConfig:
     """What moves the vehicle while learning; tests after it are in the built-in simulator."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
-    operands: ComputeDtype | Literal["auto"] = "auto"
-    """What learned models multiply; bfloat16 is faster on CPUs with AVX512_BF16, slower on others,
-    and leaves errors of prediction what they are to 1 %. A training that begins with auto tries
-    which it is, and keeps to it."""
+    compute_dtype: ComputeDtype | Literal["auto"] = "auto"
+    """Precision in which learned models multiply large matrices. bfloat16 is faster on CPUs with
+    AVX512_BF16 and slower on others; prediction errors change by less than 1 %. A training that
+    begins with auto measures which one is faster, and keeps it."""
     simulator: Simulator = Simulator()
     """The built-in simulator."""
 
@@ -74,11 +77,11 @@ class TaskConfig:
         vehicle.load(self.vehicle)  # That it cannot be read is to be said now.
 
     @property
-    def multiplied(self) -> ComputeDtype:
-        """`operands`, or which of them are faster here."""
-        if self.operands == "auto":
+    def fixed_dtype(self) -> ComputeDtype:
+        """`compute_dtype`, or the one that is faster here."""
+        if self.compute_dtype == "auto":
             return "bfloat16" if machine.multiplies_bfloat16() else "float32"
-        return self.operands
+        return self.compute_dtype
 
     @property
     def driven(self) -> VehicleConfig:
@@ -278,7 +281,7 @@ def dynamics(
         config.weights,
         vehicle=config.driven.vehicle,
         embeddings=config.navigation.embeddings,
-        compute_dtype=config.multiplied,
+        compute_dtype=config.fixed_dtype,
         exact_gradient=exact_gradient,
     )
 
@@ -321,7 +324,7 @@ def run(config: TrainConfig, worlds: TerrainMap | None = None) -> Trained:
     # So that it goes on as it began, and is tested, from wherever that is.
     paths = {name: getattr(config, name) for name in ("terrain", "weights")}
     absolute = {name: path and path.absolute() for name, path in paths.items()}
-    config = replace(config, operands=config.multiplied, **absolute)
+    config = replace(config, compute_dtype=config.fixed_dtype, **absolute)
     _log.info("drawing worlds ...")
     terrain, pool, held_out = training_ground(config, worlds)
     machine.forget_programs()
@@ -340,7 +343,7 @@ def run(config: TrainConfig, worlds: TerrainMap | None = None) -> Trained:
     machine.forget_programs()
     with Run.begin(config, config.name, restored[0] if restored else 0, config.wandb) as begun:
         _log.info("run folder %s", begun.folder)
-        products = "" if config.model == "builtin" else f", multiplying {config.operands}"
+        products = "" if config.model == "builtin" else f", multiplying {config.compute_dtype}"
         _log.info("training in %s on %d worlds%s", config.model, terrain.worlds, products)
 
         def keep(state: Any) -> None:

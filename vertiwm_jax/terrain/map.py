@@ -120,11 +120,6 @@ class TerrainMap:
         along, up = self.size * jnp.eye(2)
         return self.origin - up, self.origin + along
 
-    @property
-    def soil_set(self) -> jax.Array | int:
-        """Which of the sets of soils the selected world has."""
-        return self.world if len(self.soils.n) > 1 else 0
-
     @staticmethod
     def from_array(
         elevation: ArrayLike,

@@ -7,18 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax.config import ConfigError
-from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import _raster
 from vertiwm_jax.terrain.map import TerrainMap
 
 PATCH_PIXELS = 128
-PATCH_METRES = 12.8
+PATCH_METERS = 12.8
 CELL_PIXELS = 8
 """Side of the squares of pixels that encoders read one by one; a patch has 16 x 16 of them."""
-RELIEF_METRES = 4.0
+RELIEF_METERS = 4.0
 """Height above or below the vehicle that is 1 in a patch."""
-PIXEL_METRES = PATCH_METRES / PATCH_PIXELS
+PIXEL_METERS = PATCH_METERS / PATCH_PIXELS
 
 _CELLS = PATCH_PIXELS // CELL_PIXELS
 
@@ -41,9 +39,9 @@ def _square(number: int, metres: float) -> np.ndarray:
     return np.stack(np.meshgrid(offset, offset, indexing="ij")).reshape(2, -1).astype(np.float32)
 
 
-CELLS_OF_PATCH = _square(_CELLS, CELL_PIXELS * PIXEL_METRES)
+CELLS_OF_PATCH = _square(_CELLS, CELL_PIXELS * PIXEL_METERS)
 """`[2, 256]` m from the vehicle to the middles of cells, row by row."""
-_PIXELS_OF_CELL = _square(CELL_PIXELS, PIXEL_METRES)
+_PIXELS_OF_CELL = _square(CELL_PIXELS, PIXEL_METERS)
 
 
 @partial(jax.jit, inline=True)
@@ -52,7 +50,7 @@ def query(terrain: TerrainMap, position: jax.Array, yaw: jax.Array) -> Patches:
 
     Pixels are 0.1 m, row 0 farthest ahead, column 0 farthest left, the vehicle midway between
     the four central ones. Elevations are bilinear between vertices and count from the body origin,
-    over `RELIEF_METRES`, so they do not change when map and vehicle are lifted together. The paper
+    over `RELIEF_METERS`, so they do not change when map and vehicle are lifted together. The paper
     reads the nearest vertex and scales by the range of the whole map. Each pixel has the color of
     its class. Pixels off the map take the nearest edge. A NaN x, y or yaw sees vertex (0, 0) in
     every pixel; a NaN height gives NaN elevations. No gradient flows to the pose. Batch with
@@ -86,26 +84,10 @@ def pixels(
 ) -> tuple[jax.Array, jax.Array]:
     """Elevations `[256, 64]` above a height `[]`, m, and colors `[256, 3, 64]`, at `places`."""
     column, row = _raster.on_map(terrain, *(middles[:, :, None] + around[:, None]))
-    elevation = jnp.clip((_raster.bilinear(terrain, row, column) - height) / RELIEF_METRES, -1, 1)
+    elevation = jnp.clip((_raster.bilinear(terrain, row, column) - height) / RELIEF_METERS, -1, 1)
     semantic = _raster.classes(terrain, row, column, _raster.cell_index(terrain, row, column))
     palette = terrain.class_rgb / 127.5 - 1
     return elevation, jnp.stack([_raster.gather(c, semantic) for c in palette.T], axis=1)
-
-
-def footprint_covered(wheel_reach: float, top_speed: float) -> None:
-    """Raises unless a patch covers the wheels of the next pose (Sec. III-A), at any heading.
-
-    wheel_reach: m from the body origin to the farthest ground a wheel can touch.
-    top_speed: m/s, the largest in any direction.
-    """
-    needed, covered = wheel_reach + top_speed * STEP_SECONDS, PATCH_METRES / 2
-    if not needed <= covered:
-        fastest = (covered - wheel_reach) / STEP_SECONDS
-        raise ConfigError(
-            f"patch: expected {PATCH_METRES} m to cover the wheels of the next pose, found a reach "
-            f"of {wheel_reach:g} m + {top_speed:g} m/s x {STEP_SECONDS} s = {needed:g} m "
-            f"> {covered:g} m; keep the top speed below {fastest:g} m/s"
-        )
 
 
 def _image(cells: jax.Array) -> jax.Array:

@@ -63,7 +63,8 @@ def soil(terrain: TerrainMap, semantic: jax.Array) -> Soil:
 
 def soils(terrain: TerrainMap) -> Soil:
     """The soils `[K]` of all ground classes in the selected world."""
-    return jax.tree.map(lambda leaf: leaf[terrain.soil_set], terrain.soils)
+    own = len(terrain.soils.n) > 1
+    return jax.tree.map(lambda leaf: leaf[terrain.world if own else 0], terrain.soils)
 
 
 def height(terrain: TerrainMap, xy: jax.Array) -> jax.Array:

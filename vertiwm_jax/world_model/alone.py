@@ -1,6 +1,7 @@
 """One specialist as a model of its own."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from flax import struct
 
@@ -38,8 +39,7 @@ class Alone:
 
     def init(self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState) -> AloneHistory:
         """The specialist's history, and a look at the ground."""
-        specialist, own = self._own(params)
-        begun = specialist.init(own, params.vehicle, terrain, state)
+        begun = self.specialist.init(self._own(params), params.vehicle, terrain, state)
         return AloneHistory(self.see(params, terrain, state), begun)
 
     def see(
@@ -58,25 +58,25 @@ class Alone:
         command: Command,
     ) -> tuple[VehicleState, AloneHistory]:
         """The proposed state (Eq. 2), and a look at the ground there."""
-        specialist, own = self._own(params)
-        seen = None
+        own, seen = self._own(params), None
         if history.features:
             (seen,) = reduced(self._encoders(params.encoders), history.features)
-        state, after = specialist.propose(
+        state, after = self.specialist.propose(
             own, params.vehicle, terrain, seen, history.specialist, state, command
         )
         return state, AloneHistory(self.see(params, terrain, state), after)
 
     def part_of(self, params: VertiWMParams) -> VertiWMParams:
         """The parameters without what it does not read."""
-        encoders = self._encoders(params.encoders)
-        if isinstance(self.specialist, Transformer):
-            return VertiWMParams(encoders, params.vehicle, transformer=params.transformer)
-        return VertiWMParams(encoders, params.vehicle, nesam=params.nesam)
+        own = {self._name: self._own(params)}
+        return VertiWMParams(self._encoders(params.encoders), params.vehicle, **own)
 
-    def _own(self, params: VertiWMParams) -> tuple:
-        part = params.transformer if isinstance(self.specialist, Transformer) else params.nesam
-        return self.specialist, part
+    @property
+    def _name(self) -> str:
+        return "transformer" if isinstance(self.specialist, Transformer) else "nesam"
+
+    def _own(self, params: VertiWMParams) -> Any:
+        return getattr(params, self._name)
 
     def _encoders(self, encoders: tuple[Encoders, ...]) -> tuple[Encoders, ...]:
         """Those of the specialist, without what it does not ask."""

@@ -10,14 +10,14 @@ from flax import struct
 from vertiwm_jax.mechanics.simulator import Simulator, SimulatorHistory, SimulatorParams
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.mechanics.wheel import SoilContact
+from vertiwm_jax.networks.specialist import BASE, NetworkSize, SpecialistNetwork
 from vertiwm_jax.networks.transformer import KeyValueCache
 from vertiwm_jax.perception.features import TerrainFeatures
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import motion, nesam_inputs
-from vertiwm_jax.world_model.nesam_inputs import MOTION_SIGNS
-from vertiwm_jax.world_model.network import BASE, NetworkSize, SpecialistNetwork
+from vertiwm_jax.world_model.nesam_inputs import MOTION_SIGNS, StepFeatures
 from vertiwm_jax.world_model.normalization import Normalization
 
 
@@ -82,8 +82,9 @@ class Nesam:
         normalization: Normalization | None = None,
     ) -> NesamParams:
         """Physics as it is, and a network that leaves it so; its constants are still to measure."""
+        inputs = jnp.zeros(nesam_inputs.SIZE)
         return NesamParams(
-            network=self.network.init_params(key, nesam_inputs.SIZE),
+            network=self.network.init(key, inputs, None, self.size.empty_cache()),
             contact=physics.contact,
             stiffening=physics.stiffening,
             normalization=normalization or Normalization.unit(),
@@ -96,7 +97,7 @@ class Nesam:
     ) -> NesamHistory:
         """The simulator's history, and no steps."""
         memory = self.simulator.init(params.physics(vehicle), terrain, state)
-        return NesamHistory(memory, self.network.empty_cache((2,)), state)
+        return NesamHistory(memory, self.size.empty_cache((2,)), state)
 
     def propose(
         self,
@@ -113,9 +114,10 @@ class Nesam:
             unit_weight = query.soils(terrain).unit_weight
             terrain = terrain.with_soils(replace(features.soil, unit_weight=unit_weight))
         physics, memory = self._physics(params, vehicle, terrain, history.simulator, state, command)
-        step = history.physics, state, command, physics, memory
-        inputs = nesam_inputs.of(params.normalization, params.correction_scale, vehicle, *step)
-        outputs, cache = self.network.step(params.network, inputs, None, history.cache)
+        constants = _fixed((params.normalization, params.correction_scale, vehicle))
+        step = StepFeatures.of(*constants, history.physics, state, command, physics, memory)
+        found: Any = self.network.apply(params.network, step.both, None, history.cache)
+        outputs, cache = found
         mean = 0.5 * (outputs[0] + MOTION_SIGNS * outputs[1])
         correction = _fixed(params.correction_scale) * mean
         return motion.corrected(physics, correction), NesamHistory(memory, cache, physics)

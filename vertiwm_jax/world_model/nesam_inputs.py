@@ -35,25 +35,6 @@ SIZE = _BODY_SIGNS.size + 4 * _WHEEL_SIGNS.size
 """Numbers in `StepFeatures.flat`."""
 
 
-def of(
-    constants: Normalization,
-    correction_scale: jax.Array,
-    vehicle: Vehicle,
-    expected: VehicleState,
-    state: VehicleState,
-    command: Command,
-    physics: VehicleState,
-    memory: SimulatorHistory,
-) -> jax.Array:
-    """`[2, ..., SIZE]` what the network reads of steps `[...]`, and in a mirror.
-
-    expected: what physics had made of `state`; physics, memory: what it makes of the next.
-    """
-    fixed = jax.lax.stop_gradient((constants, correction_scale, vehicle))
-    seen = StepFeatures.of(*fixed, expected, state, command, physics, memory)
-    return jnp.stack([seen.flat, seen.mirrored.flat])
-
-
 class StepFeatures(NamedTuple):
     """Of any number of steps `[...]`, each about 1.
 
@@ -65,6 +46,11 @@ class StepFeatures(NamedTuple):
 
     body: jax.Array
     wheels: jax.Array
+
+    @property
+    def both(self) -> jax.Array:
+        """`[2, ..., SIZE]` what the network reads, as it is and in a mirror."""
+        return jnp.stack([self.flat, self.mirrored.flat])
 
     @property
     def flat(self) -> jax.Array:
@@ -92,10 +78,10 @@ class StepFeatures(NamedTuple):
         physics: VehicleState,
         memory: SimulatorHistory,
     ) -> "StepFeatures":
-        """As `of` has its arguments.
+        """Of steps `[...]` from `state` to what physics makes of it, with its `memory`.
 
-        Of the constants only deviations are used: with the means, a mirror would not be a change
-        of signs.
+        expected: what physics had made of `state`. Of the constants only deviations are used:
+        with the means, a mirror would not be a change of signs.
         """
         body = [
             state.vector[..., LOCAL] / constants.state_deviation,

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.networks.specialist import BASE, NetworkSize, SpecialistNetwork
 from vertiwm_jax.networks.transformer import KeyValueCache
 from vertiwm_jax.perception.features import CELLS, TerrainFeatures
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import motion
-from vertiwm_jax.world_model.network import BASE, NetworkSize, SpecialistNetwork
 from vertiwm_jax.world_model.normalization import INPUTS, Normalization
 
 Ground = Literal["patches", "indicator", "none"]
@@ -45,7 +45,8 @@ class Transformer:
     ) -> TransformerParams:
         """Untrained weights; without constants, quantities are left in their units."""
         ground = {"patches": CELLS * self.size.channels, "indicator": 1, "none": 0}[self.terrain]
-        network = self.network.init_params(key, INPUTS, ground)
+        seen = jnp.zeros(ground) if ground else None
+        network = self.network.init(key, jnp.zeros(INPUTS), seen, self.size.empty_cache())
         return TransformerParams(network, normalization or Normalization.unit())
 
     def init(
@@ -53,7 +54,7 @@ class Transformer:
     ) -> KeyValueCache:
         """A history without steps."""
         del params, vehicle, terrain, state
-        return self.network.empty_cache()
+        return self.size.empty_cache()
 
     def propose(
         self,
@@ -69,7 +70,8 @@ class Transformer:
         del vehicle
         inputs = params.normalization.inputs(state, command)
         ground = self._ground(terrain, features, state)
-        outputs, cache = self.network.step(params.network, inputs, ground, history)
+        found: Any = self.network.apply(params.network, inputs, ground, history)
+        outputs, cache = found
         return motion.advance(state, params.normalization.transition(outputs)), cache
 
     @property
