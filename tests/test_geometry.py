@@ -113,7 +113,9 @@ def test_the_body_frame_points_as_the_conventions_say():
     assert (nose_down @ jnp.array([1.0, 0.0, 0.0]))[2] < 0
     left_side_up = geometry.rotation_from_rpy(jnp.array([0.3, 0.0, 0.0]))
     assert (left_side_up @ jnp.array([0.0, 1.0, 0.0]))[2] > 0
-    turned_left = geometry.pose_from_rpy(jnp.array([1.0, 2.0, 3.0]), jnp.array([0, 0, jnp.pi / 2]))
+    turned_left = jaxlie.SE3.from_rotation_and_translation(
+        geometry.rotation_from_rpy(jnp.array([0, 0, jnp.pi / 2])), jnp.array([1.0, 2.0, 3.0])
+    )
     np.testing.assert_allclose(turned_left @ jnp.array([1.0, 0.0, 0.0]), [1, 3, 3], atol=1e-6)
 
 

@@ -45,11 +45,6 @@ def rpy_from_rotation(rotation: jaxlie.SO3) -> jax.Array:
     return jnp.stack([roll, pitch, yaw], axis=-1)
 
 
-def pose_from_rpy(position: jax.Array, rpy: jax.Array) -> jaxlie.SE3:
-    """`[..., 3]` position in m and `[..., 3]` roll, pitch, yaw in rad to T_world_body."""
-    return jaxlie.SE3.from_rotation_and_translation(rotation_from_rpy(rpy), position)
-
-
 def compose(first: jaxlie.SO3, second: jaxlie.SO3) -> jaxlie.SO3:
     """The rotation first @ second, normalized."""
     (w, a), (u, b) = _parts(first), _parts(second)

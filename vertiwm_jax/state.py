@@ -20,7 +20,7 @@ STEP_SECONDS = 0.1
 class VehicleState:
     """The paper's 12-D state x = [p; eta; v; omega] (Sec. III-A).
 
-    position: `[..., 3]` p_world, m, of the body origin (between the wheel centres).
+    position: `[..., 3]` p_world, m, of the body origin (between the wheel centers).
     rpy: `[..., 3]` roll, pitch, yaw, rad; R = Rz Ry Rx, pitch > 0 is nose down.
     velocity: `[..., 3]` v_body, m/s; x forward, y left, z up.
     angular_velocity: `[..., 3]` omega_body, rad/s.
@@ -34,7 +34,8 @@ class VehicleState:
     @property
     def pose(self) -> jaxlie.SE3:
         """T_world_body."""
-        return geometry.pose_from_rpy(self.position, self.rpy)
+        rotation = geometry.rotation_from_rpy(self.rpy)
+        return jaxlie.SE3.from_rotation_and_translation(rotation, self.position)
 
     @property
     def vector(self) -> jax.Array:

@@ -22,7 +22,6 @@ from vertiwm_jax.mechanics.suspension import (
     LARGEST_LOAD,
     LEAST_SINKAGE,
     LEAST_UPRIGHT,
-    QUADRATURE_NODES,
 )
 from vertiwm_jax.mechanics.vehicle import GRAVITY
 from vertiwm_jax.state import STEP_SECONDS
@@ -68,7 +67,7 @@ class Simulator:
     def __init__(self, vehicle: Any, contact: Any, stiffening: float, substeps: int):
         self.vehicle, self.contact = vehicle, contact
         self.substeps, self.seconds = substeps, STEP_SECONDS / substeps
-        self.quadrature = gauss_legendre(QUADRATURE_NODES)
+        self.quadrature = gauss_legendre(int(contact.nodes))
         self.masses = torch.diag(torch.cat([torch.full((3,), vehicle.mass), vehicle.inertia]))
         self.scaled = torch.tensor([stiffening, stiffening, 1.0, 1.0, 1.0, 1.0])
 

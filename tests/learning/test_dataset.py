@@ -122,9 +122,7 @@ def test_collections_of_other_classes_are_refused(tmp_path):
         (tmp_path / name).mkdir()
         path = write(tmp_path / name)
     names = ("moss", *STANDARD.names[1:])
-    classes = GroundClasses(
-        names, STANDARD.rgb, STANDARD.friction, STANDARD.friction_deviation, STANDARD.soils
-    )
+    classes = GroundClasses(names, STANDARD.rgb, STANDARD.friction, STANDARD.soils)
     moss = TerrainMap.from_array(np.ones((9, 9)), np.full((4, 4), GRASS), ground=classes)
     files.save(moss, tmp_path / "own" / "maps" / "hill.npz")
     with pytest.raises(MapError, match="class_names: expected") as caught:

@@ -20,8 +20,9 @@ SHARP = ScmParams(creep_speed=1e-5)
 SMOOTH = ScmParams(creep_speed=0.4)
 
 
-def scm_forces(wheel, soil, contact, sinkage, vx, vy, omega, *rut, **nodes):
-    return contact.forces(wheel, soil, sinkage, (vx, vy, omega), *rut, **nodes)
+def scm_forces(wheel, soil, contact, sinkage, vx, vy, omega, *rut, nodes=6):
+    contact = replace(contact, nodes=nodes)
+    return contact.forces(wheel, soil, sinkage, (vx, vy, omega), *rut)
 
 
 run = jax.jit(scm_forces, static_argnames="nodes")

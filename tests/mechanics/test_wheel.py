@@ -18,8 +18,8 @@ WHEEL = Wheel(0.467, 0.254)
 SOILS = stack([PRESETS[name] for name in ("sand", "heavy_clay_25", "snow_us")])
 
 
-def forces(wheel, soil, contact, sinkage, vx, vy, omega, *rut, **nodes):
-    return contact.forces(wheel, soil, sinkage, (vx, vy, omega), *rut, **nodes)
+def forces(wheel, soil, contact, sinkage, vx, vy, omega, *rut, nodes=6):
+    return contact.replace(nodes=nodes).forces(wheel, soil, sinkage, (vx, vy, omega), *rut)
 
 
 run = jax.jit(forces, static_argnames="nodes")

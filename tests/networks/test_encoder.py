@@ -12,6 +12,11 @@ KEY = jax.random.key(0)
 CHANNELS = (1, 3)
 
 
+def encode(model, params, patches):
+    own = {"params": params["params"]["encoder"]}
+    return TerrainEncoder(model.channels).apply(own, patches)
+
+
 def moved(params):
     """Away from the first values, so that no weight is zero."""
     return jax.tree.map(lambda x: x + 0.1 * jnp.cos(jnp.arange(x.size)).reshape(x.shape), params)
@@ -49,11 +54,11 @@ def test_shapes_and_batches(channels, batch):
     model = TerrainAutoencoder(channels)
     patches = patch(channels, *batch)
     params = moved(model.init(KEY, patches))
-    latent = model.apply(params, patches, method=model.encode)
+    latent = encode(model, params, patches)
     again = model.apply(params, patches)
     assert latent.shape == (*batch, 16, 16, 18) and again.shape == patches.shape
     last = (-1,) * len(batch)
-    single = model.apply(params, patches[last], method=model.encode)
+    single = encode(model, params, patches[last])
     np.testing.assert_allclose(single, latent[last], atol=1e-4)
 
 

@@ -88,7 +88,6 @@ def test_save_keeps_the_selected_world_and_classes_of_ones_own(tmp_path):
         names=("regolith", "plate"),
         rgb=np.array([[10, 20, 30], [200, 0, 0]], np.uint8),
         friction=np.array([0, 0.7], np.float32),
-        friction_deviation=np.zeros(2, np.float32),
         soils={"regolith": STANDARD.soils["sand"].replace(kphi=np.float32(820e3))},
     )
     worlds = [

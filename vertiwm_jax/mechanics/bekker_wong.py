@@ -1,6 +1,6 @@
 """The wheel in soil by Bekker and Wong: angles, normal stress, shear and bulldozing, summed up.
 
-Angles are from the downward vertical, positive towards the direction of travel. The soil is
+Angles are from the downward vertical, positive toward the direction of travel. The soil is
 entered at th1, stressed most at thm, left at th2; where the wheel skids the flow of soil under
 it reverses at th0. Everything is elementwise over any axes `[...]`.
 
@@ -19,8 +19,8 @@ from flax import struct
 
 from vertiwm_jax.mechanics.wheel import (
     Arrays,
+    Float,
     Motion,
-    Scalar,
     Wheel,
     WheelForces,
     broadcast,
@@ -49,27 +49,23 @@ class BekkerWongParams:
         enough to be felt in a rut only.
     creep_speed: m/s below which shear fades out, so that a standing wheel has smooth forces.
     bulldozing: pressure on the wheel's side, "ishigami" (2007) or "wong" (2008).
+    nodes: of Gauss-Legendre's rule in each of the five pieces of the contact.
     """
 
-    peak: Scalar = 0.4
-    peak_slip: Scalar = 0.15
-    exit: Scalar = 0.0
-    exit_slip: Scalar = 0.0
-    rebound: Scalar = 0.0
-    slip_sinkage: Scalar = 0.0
-    skid_sinkage: Scalar = 0.0
-    unload_stiffness: Scalar = 2e8
-    creep_speed: Scalar = 0.05
+    peak: Float = 0.4
+    peak_slip: Float = 0.15
+    exit: Float = 0.0
+    exit_slip: Float = 0.0
+    rebound: Float = 0.0
+    slip_sinkage: Float = 0.0
+    skid_sinkage: Float = 0.0
+    unload_stiffness: Float = 2e8
+    creep_speed: Float = 0.05
     bulldozing: Literal["ishigami", "wong"] = struct.field(pytree_node=False, default="ishigami")
+    nodes: int = struct.field(pytree_node=False, default=6)
 
     def forces(
-        self,
-        wheel: Wheel,
-        soil: Soil,
-        sinkage: Scalar,
-        motion: Motion,
-        rut: Scalar = 0.0,
-        nodes: int = 6,
+        self, wheel: Wheel, soil: Soil, sinkage: Float, motion: Motion, rut: Float = 0.0
     ) -> WheelForces:
         """As `SoilContact.forces`, continuous through every regime.
 
@@ -110,7 +106,7 @@ class BekkerWongParams:
             )
             return weight * extent, found
 
-        total = integrated(stresses, _quadrature(nodes), shape)
+        total = integrated(stresses, _quadrature(self.nodes), shape)
         longitudinal, lateral, normal, torque = (jnp.where(touching, t, 0.0) for t in total)
         area = wheel.radius * wheel.width
         return WheelForces(
@@ -161,7 +157,7 @@ class Arc(NamedTuple):
     cos: jax.Array
 
 
-def travel(wheel: Wheel, creep_speed: Scalar, motion: Motion) -> Travel:
+def travel(wheel: Wheel, creep_speed: Float, motion: Motion) -> Travel:
     """The motion of a wheel `[...]`; values and gradients are finite everywhere."""
     velocity_x, velocity_y, omega = motion
     rim = wheel.radius * omega
@@ -235,7 +231,7 @@ def pressing_depth(p: Patch, angle: jax.Array) -> jax.Array:
 
 
 def reloading(
-    contact: BekkerWongParams, keq: Scalar, n: Scalar, rut: Scalar
+    contact: BekkerWongParams, keq: Float, n: Float, rut: Float
 ) -> tuple[jax.Array, jax.Array]:
     """Depth in m of the floor of a rut after its elastic rebound, and its stiffness in Pa/m.
 
@@ -251,9 +247,7 @@ def reloading(
     return floor, jnp.where(compacted, stiffness, 1e15)
 
 
-def normal_stress(
-    keq: Scalar, n: Scalar, unload: Scalar, floor: jax.Array, z: jax.Array
-) -> jax.Array:
+def normal_stress(keq: Float, n: Float, unload: Float, floor: jax.Array, z: jax.Array) -> jax.Array:
     """Bekker's pressure in Pa, `z` m below the floor of the rut, never above elastic reloading."""
     # The clip keeps the slope of z^n finite where n < 1.
     z = jnp.maximum(z, 1e-9)
@@ -284,7 +278,7 @@ def shear_stress(
 
 
 def bulldozing(
-    soil: Soil, contact: BekkerWongParams, radius: Scalar, p: Patch, m: Travel, at: Arc
+    soil: Soil, contact: BekkerWongParams, radius: Float, p: Patch, m: Travel, at: Arc
 ) -> jax.Array:
     """Side force per angle and wheel radius, N/(rad m), of the soil the wheel's flank pushes."""
     sin_slip_angle = -m.lateral * jax.lax.rsqrt(m.hub**2 + m.lateral**2 + contact.creep_speed**2)
@@ -307,8 +301,8 @@ def bulldozing(
 def _quadrature(nodes: int) -> Arrays:
     """Panel, Gauss-Legendre point and weight on [0, 1] of every node, `[panels * nodes]`.
 
-    Crowded by a square towards the exit in the first panel and the entry in the last, where
-    stress grows like a power and shear like an exponential of the distance, by a cubic towards
+    Crowded by a square toward the exit in the first panel and the entry in the last, where
+    stress grows like a power and shear like an exponential of the distance, by a cubic toward
     both ends of those between, where shear reverses.
     """
     x, w = np.polynomial.legendre.leggauss(nodes)

@@ -107,7 +107,7 @@ def _wheel_contacts(
     A wheel is a cylinder. Testing points on both rims, rather than the ground under the hub,
     lets it roll over edges and stand on a rim; neighboring points of like depth share the
     contact, so that it moves smoothly. It rests on either rigid ground or soil: soil carries only
-    what has sunk into it, so rigid ground beside it is a step, whose edge pushes towards the axle.
+    what has sunk into it, so rigid ground beside it is a step, whose edge pushes toward the axle.
     """
     soft = terrain.deformable[tread.semantic]
     carried = tread.depth - jnp.where(soft, jnp.maximum(sinkage, LEAST_YIELD), 0.0)

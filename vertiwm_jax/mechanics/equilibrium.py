@@ -3,20 +3,14 @@
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax.mechanics.wheel import MAX_SINKAGE, Motion, Scalar, SoilContact, Wheel
+from vertiwm_jax.mechanics.wheel import MAX_SINKAGE, Float, Motion, SoilContact, Wheel
 from vertiwm_jax.terrain.soil import Soil
 
 _BISECTIONS = 26  # of 1.5 radii: past the last bit of float32
 
 
 def equilibrium_sinkage(
-    wheel: Wheel,
-    soil: Soil,
-    contact: SoilContact,
-    load: Scalar,
-    motion: Motion,
-    rut: Scalar = 0.0,
-    nodes: int = 6,
+    wheel: Wheel, soil: Soil, contact: SoilContact, load: Float, motion: Motion, rut: Float = 0.0
 ) -> jax.Array:
     """Sinkage in m at which the normal force equals `load` in N, all `[...]`.
 
@@ -26,7 +20,7 @@ def equilibrium_sinkage(
     """
 
     def unbalanced(sinkage: jax.Array) -> jax.Array:
-        return contact.forces(wheel, soil, sinkage, motion, rut, nodes).normal - load
+        return contact.forces(wheel, soil, sinkage, motion, rut).normal - load
 
     def bisect(residual, low: jax.Array) -> jax.Array:
         def halve(_, bracket: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

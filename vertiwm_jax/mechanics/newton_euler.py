@@ -9,7 +9,7 @@ from vertiwm_jax.vector import Axes, Vector, sum_of
 
 
 class Twist(NamedTuple):
-    """Velocity of the centre of mass (m/s) and angular velocity (rad/s), in body components."""
+    """Velocity of the center of mass (m/s) and angular velocity (rad/s), in body components."""
 
     linear: Vector
     angular: Vector
@@ -30,7 +30,7 @@ class DampedForce(NamedTuple):
 class ContactForce(NamedTuple):
     """All that acts on points `[C]` of the body, in its components.
 
-    arm: of the points from the centre of mass, m. force: N, at the current velocity.
+    arm: of the points from the center of mass, m. force: N, at the current velocity.
     damping: N s/m, rows of a symmetric matrix: force lost per velocity gained.
     """
 
@@ -50,7 +50,7 @@ class ContactForce(NamedTuple):
 
 
 def velocity_at(twist: Twist, arm: Vector) -> Vector:
-    """Velocity of body points `[C]` at `arm` from the centre of mass, m/s."""
+    """Velocity of body points `[C]` at `arm` from the center of mass, m/s."""
     return twist.linear.plus(twist.angular.cross(arm))
 
 
@@ -68,7 +68,7 @@ def advance_twist(
     of every contact acts on the new velocity, so stiff springs and sticking friction are stable
     at any step (Hairer and Wanner, Solving Ordinary Differential Equations II, sec. IV.7).
 
-    inertia: principal moments about the centre of mass, kg m2; gravity: m/s2, body components.
+    inertia: principal moments about the center of mass, kg m2; gravity: m/s2, body components.
     """
     diagonal = [mass, mass, mass, *inertia]
     zero = jnp.zeros_like(mass)

@@ -17,8 +17,8 @@ from flax import struct
 
 from vertiwm_jax.mechanics.wheel import (
     Arrays,
+    Float,
     Motion,
-    Scalar,
     Wheel,
     WheelForces,
     broadcast,
@@ -41,20 +41,16 @@ class ScmParams:
         of what untouched soil ahead of the hub gives: a wheel that stands, spinning or not, lies
         in its own hole, which presses on both sides alike.
     creep_speed: m/s of slip at which shear reaches 71 % of its strength.
+    nodes: of Gauss-Legendre's rule in each of the two pieces of the contact.
     """
 
-    damping: Scalar = 3e4
-    fresh_speed: Scalar = 1.0
-    creep_speed: Scalar = 0.1
+    damping: Float = 3e4
+    fresh_speed: Float = 1.0
+    creep_speed: Float = 0.1
+    nodes: int = struct.field(pytree_node=False, default=6)
 
     def forces(
-        self,
-        wheel: Wheel,
-        soil: Soil,
-        sinkage: Scalar,
-        motion: Motion,
-        rut: Scalar = 0.0,
-        nodes: int = 6,
+        self, wheel: Wheel, soil: Soil, sinkage: Float, motion: Motion, rut: Float = 0.0
     ) -> WheelForces:
         """As `SoilContact.forces`.
 
@@ -116,7 +112,7 @@ class ScmParams:
             weight = weight * (stop - start) * cos
             return weight, (tau * along, tau * across, sigma, moment)
 
-        total = integrated(stresses, _quadrature(nodes), shape)
+        total = integrated(stresses, _quadrature(self.nodes), shape)
         longitudinal, lateral, normal, torque = (jnp.where(touching, t, 0.0) for t in total)
         area = wheel.radius * wheel.width
         return WheelForces(

@@ -1,7 +1,7 @@
 """The built-in simulator: a four-wheeled vehicle on rigid, soft and mixed ground.
 
 A stand-in for a multibody simulator, differentiable throughout. Each 0.1 s command is held over a
-few sub-steps of a linearly implicit integrator: springs, dampers, tyre friction, wheel spin and
+few sub-steps of a linearly implicit integrator: springs, dampers, tire friction, wheel spin and
 soil are stiff, and all of them act on the new velocity. Wheels carry spin inertia but no mass of
 their own: a wheel is where the ground, or the droop of its damper, puts it.
 """
@@ -59,7 +59,7 @@ def chrono_like(vehicle: Vehicle) -> SimulatorParams:
     """
     return SimulatorParams(
         vehicle=jax.tree.map(jnp.asarray, vehicle),
-        contact=ScmParams(*map(jnp.float32, (3e4, 1.0, 0.4))),
+        contact=ScmParams(*map(jnp.float32, (3e4, 1.0, 0.4)), nodes=4),
         stiffening=jnp.float32(1.8),
     )
 
@@ -69,7 +69,7 @@ class SimulatorHistory:
     """What the 12-D state does not say.
 
     wheel_speed: `[4]` rad/s, positive forward.
-    travel: `[4]` m, height of the wheel centres in the body.
+    travel: `[4]` m, height of the wheel centers in the body.
     steering: `[]` rad, angle of the front wheels.
     sinkage: `[4]` m, of the wheels in soil; 0 on rigid ground.
     rut: `[2]` m, depth of the tracks that the rear wheels find, left and right.
@@ -141,9 +141,9 @@ class Simulator:
         command: Command,
     ) -> tuple[VehicleState, SimulatorHistory, GroundForces]:
         """`step`, and the forces in each of its sub-steps, leaves `[substeps, ...]`."""
-        centre = Vector.of(params.vehicle.centre_of_mass)
+        center = Vector.of(params.vehicle.centre_of_mass)
         angular = Vector.of(state.angular_velocity)
-        linear = Vector.of(state.velocity).plus(angular.cross(centre))
+        linear = Vector.of(state.velocity).plus(angular.cross(center))
         quaternion = geometry.rotation_from_rpy(state.rpy).wxyz
         body = _Body(Vector.of(state.position), quaternion, Twist(linear, angular))
 
@@ -160,7 +160,7 @@ class Simulator:
             VehicleState(
                 position=body.position.stacked(),
                 rpy=geometry.rpy_from_rotation(jaxlie.SO3(body.quaternion)),
-                velocity=linear.plus(angular.cross(centre), -1.0).stacked(),
+                velocity=linear.plus(angular.cross(center), -1.0).stacked(),
                 angular_velocity=angular.stacked(),
             ),
             history,
@@ -178,13 +178,13 @@ def _substep(
 ) -> tuple[_Body, SimulatorHistory, GroundForces]:
     vehicle = params.vehicle
     axes = Axes.from_quaternion(body.quaternion)
-    centre = Vector.of(vehicle.centre_of_mass)
+    center = Vector.of(vehicle.centre_of_mass)
     forward = body.twist.linear.x
     spin, before = history.wheel_speed, history.sinkage
     driven = actuate(vehicle, command, forward, history.steering, spin, seconds)
     where = body.position, axes, history.travel, driven.angle
     wheels, hull = contacts(vehicle, terrain, *where, before)
-    n, arm = wheels.normal, wheels.point.plus(centre, -1.0)
+    n, arm = wheels.normal, wheels.point.plus(center, -1.0)
     rolling, lateral = tangents(n, jnp.cos(driven.angle), jnp.sin(driven.angle))
     velocity = velocity_at(body.twist, arm)
     ahead, drift = velocity.dot(rolling), velocity.dot(lateral)
@@ -214,7 +214,7 @@ def _substep(
         DampedForce(rolling, traction, traction_rate),
         DampedForce(lateral, ground.lateral, grip),
     )
-    on_hull = hull_contact(vehicle, body.twist, hull, centre, seconds)
+    on_hull = hull_contact(vehicle, body.twist, hull, center, seconds)
     gravity = Vector(axes.x.z, axes.y.z, axes.z.z).times(-GRAVITY)
     inertia_of_body = Vector.of(vehicle.inertia)
     twist = advance_twist(
@@ -241,7 +241,7 @@ def _substep(
     forces = (applied(contact, body.twist, twist) for contact in (on_wheels, on_hull))
     of_wheels, of_hull = (axes.to_world(force).stacked() for force in forces)
     on_ground = GroundForces(of_wheels, of_hull[0])
-    return _advance_pose(vehicle, body, axes, centre, twist, seconds), history, on_ground
+    return _advance_pose(vehicle, body, axes, center, twist, seconds), history, on_ground
 
 
 def stiffened(params: SimulatorParams, soil: Soil) -> Soil:
@@ -250,14 +250,14 @@ def stiffened(params: SimulatorParams, soil: Soil) -> Soil:
 
 
 def _advance_pose(
-    vehicle: Vehicle, body: _Body, axes: Axes, centre: Vector, twist: Twist, seconds: float
+    vehicle: Vehicle, body: _Body, axes: Axes, center: Vector, twist: Twist, seconds: float
 ) -> _Body:
-    """Moves the centre of mass by the new velocity and turns the body about it."""
+    """Moves the center of mass by the new velocity and turns the body about it."""
     turn = geometry.rotation_from_vector(seconds * twist.angular.stacked())
     quaternion = geometry.compose(jaxlie.SO3(body.quaternion), turn).wxyz
-    at_centre = axes.to_world(centre.plus(twist.linear, seconds))
+    at_center = axes.to_world(center.plus(twist.linear, seconds))
     # Of the large number that a place may be, only one sum is rounded.
-    gone = at_centre.plus(Axes.from_quaternion(quaternion).to_world(centre), -1.0)
+    gone = at_center.plus(Axes.from_quaternion(quaternion).to_world(center), -1.0)
     position = body.position.plus(gone)
     inertia = Vector.of(vehicle.inertia)
     return _Body(position, quaternion, turned(twist, inertia, Axes.from_quaternion(turn.wxyz)))

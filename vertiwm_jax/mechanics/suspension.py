@@ -12,8 +12,6 @@ from vertiwm_jax.mechanics.wheel import Motion, SoilContact, Wheel, WheelForces,
 from vertiwm_jax.terrain.soil import Soil
 from vertiwm_jax.vector import Vector
 
-QUADRATURE_NODES = 4
-"""In each piece of a wheel's contact."""
 LEAST_SINKAGE = 1e-3
 """Sinkage, m, below which soil counts as linear."""
 LARGEST_LOAD = 2.5
@@ -89,11 +87,11 @@ def support(
 
     sinkage: m, so far.
 
-    Soil and suspension share the depth: one Newton step a sub-step towards the sinkage at which
+    Soil and suspension share the depth: one Newton step a sub-step toward the sinkage at which
     their forces agree. Rigid ground leaves all of it to the suspension.
     """
     wheel = Wheel(vehicle.wheel_radius, vehicle.wheel_width)
-    in_soil = contact.forces(wheel, soil, sinkage, motion, rut, QUADRATURE_NODES)
+    in_soil = contact.forces(wheel, soil, sinkage, motion, rut)
     # Normal force grows about like sinkage to the power n + 1/2 (Bekker, wheel on flat ground).
     sunk = jnp.maximum(sinkage - rut, LEAST_SINKAGE)
     yielding = (soil.n + 0.5) * in_soil.normal / sunk
@@ -113,13 +111,13 @@ def support(
 
 
 def hull_contact(
-    vehicle: Vehicle, twist: Twist, hull: GroundContact, centre: Vector, seconds: float
+    vehicle: Vehicle, twist: Twist, hull: GroundContact, center: Vector, seconds: float
 ) -> ContactForce:
     """The chassis on the ground: a heavily damped spring, and friction.
 
     Soil gives way under the belly, as Chrono's SCM feels wheels only, but not under a roof.
     """
-    arm, n = hull.point.plus(centre, -1.0), hull.normal
+    arm, n = hull.point.plus(center, -1.0), hull.normal
     forward, left = tangents(n, jnp.ones(1), jnp.zeros(1))
     velocity = velocity_at(twist, arm)
     stiffness = 2 * vehicle.mass / HULL_SECONDS**2

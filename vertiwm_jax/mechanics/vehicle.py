@@ -41,7 +41,7 @@ class Vehicle:
     wheel_torque: `[]` N m a wheel at full throttle; wheel_power: `[]` W a wheel at most.
     wheel_speed_limit: `[]` rad/s, mean wheel speed beyond which the engine gives nothing.
     brake_torque: `[]` N m a wheel at full braking.
-    tyre_friction: `[]` the tyre's own friction coefficient; contact takes the smaller one.
+    tyre_friction: `[]` the tire's own friction coefficient; contact takes the smaller one.
     hull: `[P, 3]` m, points of the chassis that touch the ground first, underside and roof.
     length, width: `[]` m, the rectangle that collides with obstacles, centerd on the origin.
     """
@@ -157,7 +157,7 @@ class VehicleConfig:
     brake_torque: Positive
     """N m a wheel at full braking."""
     tyre_friction: Positive
-    """The tyre's own friction coefficient; contact takes the smaller one."""
+    """The tire's own friction coefficient; contact takes the smaller one."""
     hull: tuple[float, float, float, float]
     """The chassis as a box, m: half its length, half its width, height of underside and roof."""
     length: Positive

@@ -15,9 +15,9 @@ from flax import struct
 from vertiwm_jax.terrain.soil import Soil
 
 T = TypeVar("T")
-Scalar = jax.Array | float
+Float = jax.Array | float
 Arrays = tuple[jax.Array, ...]
-Motion = tuple[Scalar, Scalar, Scalar]
+Motion = tuple[Float, Float, Float]
 """Of a wheel: velocity of the hub ahead and to the left, m/s, and spin, rad/s, positive ahead."""
 
 MIN_SINKAGE = 1e-6
@@ -30,8 +30,8 @@ MAX_SINKAGE = 1.5
 class Wheel:
     """A rigid wheel `[...]`. radius, width: m."""
 
-    radius: Scalar
-    width: Scalar
+    radius: Float
+    width: Float
 
 
 @struct.dataclass
@@ -54,13 +54,7 @@ class SoilContact(Protocol):
     """Parameters of a contact with soil, whose method gives its forces on a wheel."""
 
     def forces(
-        self,
-        wheel: Wheel,
-        soil: Soil,
-        sinkage: Scalar,
-        motion: Motion,
-        rut: Scalar = 0.0,
-        nodes: int = 6,
+        self, wheel: Wheel, soil: Soil, sinkage: Float, motion: Motion, rut: Float = 0.0
     ) -> WheelForces:
         """Forces on a wheel at a given sinkage, all `[...]`.
 
@@ -70,7 +64,6 @@ class SoilContact(Protocol):
                 force.
             motion: of the wheel.
             rut: m, the deepest sinkage that earlier passes left.
-            nodes: of Gauss-Legendre's rule in each piece of the contact.
         """
         ...
 
@@ -81,7 +74,7 @@ def broadcast(arguments: T) -> tuple[tuple[int, ...], T]:
     return jnp.broadcast_shapes(*(x.shape for x in jax.tree.leaves(arrays))), arrays
 
 
-def depth_below(floor: Scalar, sinkage: jax.Array, wheel: Wheel) -> tuple[jax.Array, jax.Array]:
+def depth_below(floor: Float, sinkage: jax.Array, wheel: Wheel) -> tuple[jax.Array, jax.Array]:
     """How deep a wheel is in the soil below `floor`, m, in radii, and whether it touches it."""
     depth = jnp.clip((sinkage - floor) / wheel.radius, 0.0, MAX_SINKAGE)
     touching = depth > MIN_SINKAGE
@@ -106,7 +99,7 @@ def integrated(
 
 
 def rigid_forces(
-    wheel: Wheel, friction: Scalar, load: Scalar, motion: Motion, creep_speed: Scalar = 0.05
+    wheel: Wheel, friction: Float, load: Float, motion: Motion, creep_speed: Float = 0.05
 ) -> WheelForces:
     """Coulomb friction under a wheel on rigid ground, all `[...]`; |force| < friction load.
 

@@ -68,10 +68,7 @@ class ModelConfig:
         return VertiWM(self.transformer, self.nesam, self.gate_terrain, self.coefficients)
 
     def init_params(
-        self,
-        key: jax.Array,
-        physics: SimulatorParams,
-        normalization: Normalization | None = None,
+        self, key: jax.Array, physics: SimulatorParams, normalization: Normalization | None = None
     ) -> VertiWMParams:
         """Untrained parameters of all parts.
 

@@ -18,7 +18,7 @@ class TerrainEncoder(nn.Module):
     """A small U-Net from a patch to its latent; 21,586 parameters for one and three channels.
 
     A linear map takes every cell of 8 x 8 pixels straight to its 18 numbers, which is what keeps
-    centimetres of relief; a branch at half the resolution adds what the neighbourhood says.
+    centimeters of relief; a branch at half the resolution adds what the neighborhood says.
     Nothing runs at the resolution of the pixels: 1.6 MFLOP for one channel, 2.8 for three.
 
     channels: 1 for elevation, 3 for semantic colors.
@@ -75,10 +75,6 @@ class TerrainAutoencoder(nn.Module):
         """`[..., 128, 128, channels]` to its reconstruction, of the same shape."""
         return self.decoder(self.encoder(patch))
 
-    def encode(self, patch: jax.Array) -> jax.Array:
-        """`[..., 128, 128, channels]` to `[..., 16, 16, 18]`."""
-        return self.encoder(patch)
-
 
 def _analysis(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> jax.Array:
     """The encoder's first map `[C, 64, 18]`: the smoothest cosine modes of a cell, 18 / C each.
@@ -107,8 +103,8 @@ def _cosine_modes(count: int) -> tuple[np.ndarray, np.ndarray]:
     ground, are scaled up.
     """
     frequency = np.arange(CELL_PIXELS)
-    centre = np.arange(CELL_PIXELS) + 0.5
-    wave = np.cos(np.pi / CELL_PIXELS * centre[:, None] * frequency)
+    center = np.arange(CELL_PIXELS) + 0.5
+    wave = np.cos(np.pi / CELL_PIXELS * center[:, None] * frequency)
     wave /= np.linalg.norm(wave, axis=0)
     i, j = (index.ravel() for index in np.meshgrid(frequency, frequency, indexing="ij"))
     smoothest = np.argsort(i**2 + j**2, kind="stable")[:count]

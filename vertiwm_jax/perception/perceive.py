@@ -15,10 +15,7 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 
 def perceive(
-    encoders: tuple[Encoders, ...],
-    terrain: TerrainMap,
-    state: VehicleState,
-    latents: bool = False,
+    encoders: tuple[Encoders, ...], terrain: TerrainMap, state: VehicleState, latents: bool = False
 ) -> tuple[TerrainFeatures, ...]:
     """What each pair of encoders makes of the ground at one vehicle's pose, Q(M; sg(T)).
 

@@ -1,4 +1,4 @@
-"""Ground classes: names, colours, friction and soils, and the standard ten of Verti-Bench."""
+"""Ground classes: names, colors, friction and soils, and the standard ten of Verti-Bench."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,14 +15,12 @@ class GroundClasses:
 
     rgb: `[K, 3]` uint8 palette.
     friction: `[K]` mean friction coefficient; 0 for soils.
-    friction_deviation: `[K]` standard deviation between patches; 0 for soils.
     soils: the soil of each deformable class, by name.
     """
 
     names: tuple[str, ...]
     rgb: np.ndarray
     friction: np.ndarray
-    friction_deviation: np.ndarray
     soils: Mapping[str, Soil]
 
     @property
@@ -36,28 +34,25 @@ class GroundClasses:
 
 
 _TABLE = {
-    # name: (red, green, blue), friction mean and deviation (Verti-Bench; None is soil)
-    "clay": ((178, 90, 60), (0.60, 0.05)),
-    "concrete": ((160, 160, 165), (0.85, 0.08)),
-    "dirt": ((120, 80, 50), (0.60, 0.10)),
-    "grass": ((80, 150, 60), (0.36, 0.07)),
-    "gravel": ((140, 130, 110), (0.55, 0.10)),
-    "rock": ((90, 95, 105), (0.65, 0.08)),
-    "wood": ((190, 140, 80), (0.45, 0.06)),
-    "mud": ((70, 50, 35), None),
-    "sand": ((225, 200, 130), None),
-    "snow": ((240, 245, 255), None),
+    # name: (red, green, blue), mean friction coefficient (Verti-Bench; 0 is soil)
+    "clay": ((178, 90, 60), 0.60),
+    "concrete": ((160, 160, 165), 0.85),
+    "dirt": ((120, 80, 50), 0.60),
+    "grass": ((80, 150, 60), 0.36),
+    "gravel": ((140, 130, 110), 0.55),
+    "rock": ((90, 95, 105), 0.65),
+    "wood": ((190, 140, 80), 0.45),
+    "mud": ((70, 50, 35), 0.0),
+    "sand": ((225, 200, 130), 0.0),
+    "snow": ((240, 245, 255), 0.0),
 }
 
 STANDARD = GroundClasses(
     names=tuple(_TABLE),
     rgb=np.array([rgb for rgb, _ in _TABLE.values()], np.uint8),
-    friction=np.array([(f or (0, 0))[0] for _, f in _TABLE.values()], np.float32),
-    friction_deviation=np.array([(f or (0, 0))[1] for _, f in _TABLE.values()], np.float32),
-    soils={name: soil.PRESETS[name] for name, (_, friction) in _TABLE.items() if friction is None},
+    friction=np.array([friction for _, friction in _TABLE.values()], np.float32),
+    soils={name: soil.PRESETS[name] for name in ("mud", "sand", "snow")},
 )
 """The ten classes of Verti-Bench; ids 0 to 6 are rigid, 7 to 9 are soils."""
 
 FIRST_DEFORMABLE = 7
-FRICTION_LIMITS = (0.1, 1.0)
-"""Bounds of drawn friction coefficients."""

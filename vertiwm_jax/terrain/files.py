@@ -114,7 +114,7 @@ def _classes(meta: dict, rgb: np.ndarray, name: str) -> GroundClasses:
             raise MapError(name, f"meta.soils.{key}", expected, f"{len(values)}")
         soils[key] = _soil(key, dict(zip(meta["soil_fields"], values, strict=True)), name)
     # What friction the classes have on average is not in the file: every patch has its own.
-    return GroundClasses(names, rgb, np.zeros(len(names)), np.zeros(len(names)), soils)
+    return GroundClasses(names, rgb, np.zeros(len(names)), soils)
 
 
 def _soil(key: str, values: dict[str, float], name: str) -> Soil:

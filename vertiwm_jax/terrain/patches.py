@@ -33,9 +33,9 @@ class Patches:
     rgb: jax.Array
 
 
-def _square(number: int, metres: float) -> np.ndarray:
+def _square(number: int, meters: float) -> np.ndarray:
     """`[2, number**2]` m ahead and to the left of the middle of a square, from its front left."""
-    offset = ((number - 1) / 2 - np.arange(number)) * metres
+    offset = ((number - 1) / 2 - np.arange(number)) * meters
     return np.stack(np.meshgrid(offset, offset, indexing="ij")).reshape(2, -1).astype(np.float32)
 
 

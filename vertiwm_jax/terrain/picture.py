@@ -40,9 +40,9 @@ def shaded(terrain: TerrainMap, world: int, enlarge: int = _PIXELS_A_VERTEX) -> 
     """
     elevation = np.asarray(terrain.elevation[world], np.float64)
     rows, columns = elevation.shape
-    centre = [(np.arange((n - 1) * enlarge) + 0.5) / enlarge for n in (rows, columns)]
-    fine = np.stack([np.interp(centre[1], np.arange(columns), line) for line in elevation])
-    fine = np.stack([np.interp(centre[0], np.arange(rows), line) for line in fine.T], axis=1)
+    center = [(np.arange((n - 1) * enlarge) + 0.5) / enlarge for n in (rows, columns)]
+    fine = np.stack([np.interp(center[1], np.arange(columns), line) for line in elevation])
+    fine = np.stack([np.interp(center[0], np.arange(rows), line) for line in fine.T], axis=1)
     spacing = float(terrain.resolution) / enlarge
     south, east = np.gradient(fine, spacing)
     # Lambert's law; light 45 degrees above the horizon.
@@ -52,12 +52,12 @@ def shaded(terrain: TerrainMap, world: int, enlarge: int = _PIXELS_A_VERTEX) -> 
     semantic = np.asarray(terrain.semantic[world])
     row, column = (
         np.minimum(at / (n - 1) * cells, cells - 1).astype(int)
-        for at, n, cells in zip(centre, (rows, columns), semantic.shape, strict=True)
+        for at, n, cells in zip(center, (rows, columns), semantic.shape, strict=True)
     )
     tint = pale(np.asarray(terrain.class_rgb)[semantic[row[:, None], column]])
     picture = tint * (0.35 + 0.75 * np.clip(shade, 0, 1))[..., None]
-    x = float(terrain.origin[0]) + centre[1] * float(terrain.resolution)
-    y = float(terrain.origin[1]) - centre[0] * float(terrain.resolution)
+    x = float(terrain.origin[0]) + center[1] * float(terrain.resolution)
+    y = float(terrain.origin[1]) - center[0] * float(terrain.resolution)
     for left, north, wide, tall, height in np.asarray(terrain.obstacles[world]):
         if height > 0:
             over = (np.abs(y - north) <= tall / 2)[:, None] & (np.abs(x - left) <= wide / 2)

@@ -81,7 +81,7 @@ def stack(soils: Sequence[Soil]) -> Soil:
 # Wong, Theory of Ground Vehicles, 4th ed. (2008), table 2.3, from snow and wet loam to sand and
 # stiff clay, widened on both sides; K after Wong's ranges by class of soil (clay .006 to snow
 # .05 m). A modulus or cohesion of zero is one too small to matter: on a logarithmic scale, and
-# beside the lowest kphi under a wheel of a quarter of a metre, 10 N/m^(n+1) is 0.2 %.
+# beside the lowest kphi under a wheel of a quarter of a meter, 10 N/m^(n+1) is 0.2 %.
 BOUNDS: dict[str, tuple[float, float]] = {
     "kc": (1e1, 5e5),
     "kphi": (2e4, 2e7),

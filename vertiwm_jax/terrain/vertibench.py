@@ -1,6 +1,6 @@
 """Reads the worlds of a Verti-Bench checkout (RobotiXX/verti_bench).
 
-A world has a gray height map with one vertex a metre, patches of 8 m with a class and a friction,
+A world has a gray height map with one vertex a meter, patches of 8 m with a class and a friction,
 and rocks and trees. Soils are where the labels say, which differs from that simulator.
 """
 

@@ -1,6 +1,6 @@
 """Procedural worlds, drawn on the device from keys: relief, ground classes, obstacles.
 
-The scale is Verti-Bench's: 128 m x 128 m, one vertex a metre, 8 m class cells, and presets of
+The scale is Verti-Bench's: 128 m x 128 m, one vertex a meter, 8 m class cells, and presets of
 difficulty with the median slope of its low, mid and high worlds, and one beyond.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from vertiwm_jax import froude, xla
 from vertiwm_jax.config import AtLeastOne, CountOrZero, Share, settings
-from vertiwm_jax.terrain.classes import FIRST_DEFORMABLE, FRICTION_LIMITS, STANDARD
+from vertiwm_jax.terrain.classes import FIRST_DEFORMABLE, STANDARD
 from vertiwm_jax.terrain.map import TerrainMap
 
 VERTICES = 129
@@ -39,6 +39,9 @@ MEDIAN_SLOPE_DEG: dict[Difficulty, float] = {"low": 5.8, "mid": 11.3, "high": 18
 
 _KINDS: tuple[Kind, ...] = get_args(Kind)
 _SLOPE_SPREAD = 0.1
+_FRICTION_LIMITS = (0.1, 1.0)
+# Of each class between patches, in Verti-Bench.
+_FRICTION_DEVIATION = np.array([0.05, 0.08, 0.1, 0.07, 0.1, 0.08, 0.06, 0, 0, 0], np.float32)
 _FFT_PERIOD = 256  # the smallest power of two that holds the map without wrapping around
 _VORONOI_CELLS = 10
 
@@ -251,9 +254,9 @@ def _classes(key: jax.Array, kind: jax.Array) -> jax.Array:
 def _friction(key: jax.Array, semantic: jax.Array) -> jax.Array:
     """A friction coefficient for each cell of rigid ground; 0 on soil."""
     mean = jnp.asarray(STANDARD.friction)[semantic]
-    deviation = jnp.asarray(STANDARD.friction_deviation)[semantic]
+    deviation = jnp.asarray(_FRICTION_DEVIATION)[semantic]
     drawn = mean + deviation * jax.random.normal(key, semantic.shape)
-    return jnp.where(semantic < FIRST_DEFORMABLE, jnp.clip(drawn, *FRICTION_LIMITS), 0.0)
+    return jnp.where(semantic < FIRST_DEFORMABLE, jnp.clip(drawn, *_FRICTION_LIMITS), 0.0)
 
 
 @functools.partial(xla.brief_jit, static_argnames=("rocks", "trees"))

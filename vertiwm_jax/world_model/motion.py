@@ -14,7 +14,7 @@ def increment(before: VehicleState, after: VehicleState) -> jax.Array:
     """`[..., 6]` xi of Eq. 3, the pose after in the body frame before: tangent order, m and rad.
 
     Positions are subtracted before they are turned: far from the origin of the map, the inverse
-    of a pose in float32 would cost more than the micrometres that matter near identity.
+    of a pose in float32 would cost more than the micrometers that matter near identity.
     """
     rotation = geometry.rotation_from_rpy(before.rpy).inverse()
     relative = jaxlie.SE3.from_rotation_and_translation(
@@ -53,11 +53,7 @@ def moved(state: VehicleState, increment: jax.Array, twist: jax.Array) -> Vehicl
     """The state T Exp(xi) with nu (Eq. 8): increment `[..., 6]` m and rad, twist `[..., 6]`."""
     position, rpy = geometry.moved(state.position, state.rpy, increment)
     return replace(
-        state,
-        position=position,
-        rpy=rpy,
-        velocity=twist[..., :3],
-        angular_velocity=twist[..., 3:],
+        state, position=position, rpy=rpy, velocity=twist[..., :3], angular_velocity=twist[..., 3:]
     )
 
 

@@ -76,10 +76,7 @@ class Nesam:
     simulator: Simulator = Simulator()
 
     def init_params(
-        self,
-        key: jax.Array,
-        physics: SimulatorParams,
-        normalization: Normalization | None = None,
+        self, key: jax.Array, physics: SimulatorParams, normalization: Normalization | None = None
     ) -> NesamParams:
         """Physics as it is, and a network that leaves it so; its constants are still to measure."""
         inputs = jnp.zeros(nesam_inputs.SIZE)

@@ -62,8 +62,7 @@ class StepFeatures(NamedTuple):
     def mirrored(self) -> "StepFeatures":
         """Left and right exchanged."""
         return StepFeatures(
-            body=self.body * _BODY_SIGNS,
-            wheels=self.wheels[..., _OTHER_SIDE, :] * _WHEEL_SIGNS,
+            body=self.body * _BODY_SIGNS, wheels=self.wheels[..., _OTHER_SIDE, :] * _WHEEL_SIGNS
         )
 
     @classmethod
