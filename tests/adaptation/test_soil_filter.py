@@ -175,8 +175,8 @@ def sinkage_and_pull(params, soil):
     vehicle, soil = params.vehicle, stiffened(params, soil)
     wheel, load = Wheel(vehicle.wheel_radius, vehicle.wheel_width), vehicle.mass * GRAVITY / 4
     motion = 2.0, 0.0, 2.0 / 0.8 / vehicle.wheel_radius
-    sinkage = equilibrium_sinkage(wheel, soil, params.contact, load, *motion)
-    return sinkage, params.contact.forces(wheel, soil, sinkage, *motion).longitudinal
+    sinkage = equilibrium_sinkage(wheel, soil, params.contact, load, motion)
+    return sinkage, params.contact.forces(wheel, soil, sinkage, motion).longitudinal
 
 
 @pytest.mark.slow
