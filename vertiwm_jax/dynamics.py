@@ -90,7 +90,8 @@ def warm_up(
     before = jax.tree.map(lambda x: x[:-1], states)
     begun = dynamics.init(params, terrain, first)
     history, _ = _steps(dynamics, params, terrain, begun, before, commands, lambda _: None)
-    return _seeing(dynamics, params, terrain, history, last)
+    see = getattr(dynamics, "see", None)
+    return replace(history, features=see(params, terrain, last)) if see else history
 
 
 def along(
@@ -123,27 +124,18 @@ def _steps(
 ) -> tuple[History, tuple[VehicleState, T]]:
     """The last history, which has seen no ground yet, and what `along` returns."""
 
+    see = getattr(dynamics, "see", None)
+
+    def seeing(history: History, features: Any) -> History:
+        return replace(history, features=features) if see else history
+
     def advance(history: History, inputs: tuple[VehicleState, Command]) -> tuple[History, Any]:
         state, command = inputs
-        history = _seeing(dynamics, params, terrain, history, state)
+        history = seeing(history, see and see(params, terrain, state))
         proposed, history = dynamics.step(params, terrain, history, state, command)
-        return _seeing(dynamics, params, terrain, history, None), (proposed, read(history))
+        return seeing(history, None), (proposed, read(history))
 
-    unseeing = _seeing(dynamics, params, terrain, begun, None)
-    return jax.lax.scan(advance, unseeing, (states, commands))
-
-
-def _seeing(
-    dynamics: Dynamics,
-    params: Params,
-    terrain: TerrainMap,
-    history: History,
-    state: VehicleState | None,
-) -> History:
-    """The history with a look at the ground at `state`, or without one, if the model looks."""
-    if see := getattr(dynamics, "see", None):
-        return replace(history, features=state and see(params, terrain, state))
-    return history
+    return jax.lax.scan(advance, seeing(begun, None), (states, commands))
 
 
 def rollout(

@@ -22,7 +22,7 @@ LATENT = jnp.zeros((16, 16, LATENT_CHANNELS))
 def params():
     keys = jax.random.split(jax.random.key(0))
     semantic = init_pair(keys[0]).semantic
-    return {"semantic": semantic, "soil": SoilPredictor().init(keys[1], LATENT, jnp.float32(0))}
+    return {"semantic": semantic, "soil": SoilPredictor().init(keys[1], LATENT)}
 
 
 def data(*kinds):
@@ -35,7 +35,7 @@ def data(*kinds):
 
 
 def test_shares_say_where_in_its_bounds_a_soil_lies():
-    predicted = SoilPredictor().apply(params()["soil"], LATENT + 1.0, jnp.float32(0))
+    predicted = SoilPredictor().apply(params()["soil"], LATENT + 1.0)
     shares = to_unit(predicted)
     assert shares.shape == (6,) and np.all((shares > 0) & (shares < 1))
     low, high = (

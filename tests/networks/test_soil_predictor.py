@@ -10,7 +10,7 @@ from vertiwm_jax.terrain.soil import BOUNDS, PRESETS, out_of_range
 
 MODEL = SoilPredictor()
 LATENT = jax.random.normal(jax.random.key(1), (4, 16, 16, 18))
-PARAMS = MODEL.init(jax.random.key(0), LATENT, jnp.float32(16e3))
+PARAMS = MODEL.init(jax.random.key(0), LATENT)
 # Presets that are cohesionless or purely frictional have a zero here.
 MAY_BE_ZERO = ("kc", "cohesion")
 
@@ -21,24 +21,24 @@ def test_parameters_are_those_of_the_paper():
 
 def test_cost():
     apply = jax.jit(MODEL.apply)
-    cost = apply.lower(PARAMS, LATENT[:1], jnp.float32(0)).compile().cost_analysis()
+    cost = apply.lower(PARAMS, LATENT[:1]).compile().cost_analysis()
     assert cost["flops"] < 1.5e6
 
 
 def test_soil_of_every_batch_element_is_its_own():
-    soil = MODEL.apply(PARAMS, LATENT, jnp.float32(16e3))
+    soil = MODEL.apply(PARAMS, LATENT)
     for leaf in jax.tree.leaves(soil):
         assert leaf.shape == (4,)
-    single = MODEL.apply(PARAMS, LATENT[2], jnp.float32(16e3))
+    single = MODEL.apply(PARAMS, LATENT[2])
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a[2], b, rtol=1e-5), soil, single)
     assert len(np.unique(np.asarray(soil.kphi))) == 4
-    np.testing.assert_array_equal(soil.unit_weight, 16e3)
+    np.testing.assert_array_equal(soil.unit_weight, 0)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1.0, 1e3])
 def test_soils_are_physical_and_gradients_finite(scale):
     def total(params, latent):
-        soil = MODEL.apply(params, latent, jnp.float32(16e3))
+        soil = MODEL.apply(params, latent)
         return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(soil)), soil
 
     gradient, soil = jax.grad(total, argnums=(0, 1), has_aux=True)(PARAMS, scale * LATENT)
@@ -63,7 +63,7 @@ def test_order_of_outputs_is_that_of_the_bounds_and_of_soil():
 
 
 def test_zero_weights_give_the_middle_of_the_bounds():
-    soil = MODEL.apply(jax.tree.map(jnp.zeros_like, PARAMS), LATENT[0], jnp.float32(0))
+    soil = MODEL.apply(jax.tree.map(jnp.zeros_like, PARAMS), LATENT[0])
     for field in ("kc", "kphi", "cohesion", "shear_modulus"):
         np.testing.assert_allclose(getattr(soil, field), np.sqrt(np.prod(BOUNDS[field])), rtol=1e-5)
     for field in ("n", "friction_angle"):

@@ -145,7 +145,7 @@ class SoilProblem:
         seen = patches.query(world, place.position, place.yaw)
         encoder = jax.lax.stop_gradient(params["semantic"])
         latent = cast(jax.Array, TerrainEncoder(3).apply(encoder, seen.rgb))
-        predicted = cast(Soil, SoilPredictor().apply(params["soil"], latent, jnp.float32(0)))
+        predicted = cast(Soil, SoilPredictor().apply(params["soil"], latent))
         kind = query.surface(world, place.position[:2]).semantic
         true = query.soil(world, kind)
         soft = terrain.deformable[kind].astype(jnp.float32)

@@ -7,7 +7,7 @@ their own: a wheel is where the ground, or the droop of its damper, puts it.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -128,9 +128,15 @@ class Simulator:
             force=jnp.zeros((4, 3)).at[:, 0].set(load),
         )
 
-    def step(self, *given: Any) -> tuple[VehicleState, SimulatorHistory]:
-        """The state 0.1 s later, and its history, of what `Dynamics.step` is given."""
-        return self.step_with_forces(*given)[:2]
+    def step(
+        self,
+        params: SimulatorParams,
+        terrain: TerrainMap,
+        history: SimulatorHistory,
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, SimulatorHistory]:
+        return self.step_with_forces(params, terrain, history, state, command)[:2]
 
     def step_with_forces(
         self,

@@ -173,16 +173,12 @@ class VehicleConfig:
                 raise ValueError(f"{name}: expected finite numbers, found {value}")
         x, y, belly, roof = self.hull
         if not (x > 0 and y > 0 and belly < roof):
-            raise ValueError(
-                f"hull: expected half the length and half the width, > 0, and an underside below "
-                f"the roof, found {self.hull}"
-            )
+            expected = "half the length and half the width, > 0, and an underside below the roof"
+            raise ValueError(f"hull: expected {expected}, found {self.hull}")
         first, second, third = sorted(self.inertia)
         if third > first + second:
-            raise ValueError(
-                f"inertia: expected no moment larger than the sum of both others, "
-                f"found {self.inertia}"
-            )
+            expected = "no moment larger than the sum of both others"
+            raise ValueError(f"inertia: expected {expected}, found {self.inertia}")
 
     @property
     def vehicle(self) -> Vehicle:

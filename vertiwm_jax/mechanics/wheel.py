@@ -6,7 +6,7 @@ leading axes `[...]`. Soil is in `bekker_wong` and `scm`, whose parameters give 
 
 from collections.abc import Callable
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -68,13 +68,13 @@ class SoilContact(Protocol):
         ...
 
 
-def broadcast(arguments: T) -> tuple[tuple[int, ...], T]:
+def broadcast(arguments: T) -> tuple[Any, T]:
     """The shape that all leaves broadcast to, and these in float32."""
     arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), arguments)
     return jnp.broadcast_shapes(*(x.shape for x in jax.tree.leaves(arrays))), arrays
 
 
-def depth_below(floor: Float, sinkage: jax.Array, wheel: Wheel) -> tuple[jax.Array, jax.Array]:
+def depth_below(floor: Float, sinkage: Float, wheel: Wheel) -> tuple[jax.Array, jax.Array]:
     """How deep a wheel is in the soil below `floor`, m, in radii, and whether it touches it."""
     depth = jnp.clip((sinkage - floor) / wheel.radius, 0.0, MAX_SINKAGE)
     touching = depth > MIN_SINKAGE

@@ -16,14 +16,13 @@ class SoilPredictor(nn.Module):
     """
 
     @nn.compact
-    def __call__(self, latent: jax.Array, unit_weight: jax.Array) -> Soil:
+    def __call__(self, latent: jax.Array) -> Soil:
         """`[..., 16, 16, 18]` semantic latent to a soil `[...]`.
 
-        unit_weight: rho g, N/m3, `[...]` or broadcast; passed through, for it is not among the
-            six and enters the bulldozing force alone.
+        Its unit weight, which is not among the six and enters the bulldozing force alone, is 0.
         """
         x = nn.silu(nn.Conv(32, (3, 3), strides=2)(latent))
         x = nn.silu(nn.Conv(64, (3, 3), strides=2)(x))
         x = jnp.mean(x, axis=(-3, -2))
         x = nn.silu(nn.Dense(64)(x))
-        return from_unit(nn.sigmoid(nn.Dense(len(BOUNDS))(x)), unit_weight)
+        return from_unit(nn.sigmoid(nn.Dense(len(BOUNDS))(x)), jnp.float32(0))

@@ -66,7 +66,7 @@ def init_reduce(key: jax.Array, channels: int) -> Any:
 
 def init_soil(key: jax.Array) -> Any:
     """Untrained `Encoders.soil`."""
-    return _SOIL.init(key, jnp.zeros((*EMBEDDING_SHAPE[:2], LATENT_CHANNELS)), jnp.float32(0))
+    return _SOIL.init(key, jnp.zeros((*EMBEDDING_SHAPE[:2], LATENT_CHANNELS)))
 
 
 def encode(encoders: Encoders, patches: Patches) -> tuple[jax.Array, jax.Array]:
@@ -88,13 +88,15 @@ def features(
     in_rows: brings cells `[..., c]` that are given in another order to `[16, 16, c]`.
     """
     over_space = tuple(range(elevation.ndim - 1))
-    both, reduced = (elevation, semantic), None
+    both, reduced, soil = (elevation, semantic), None, None
     if encoders.reduce is not None:
         reduced = in_rows(reduce(encoders.reduce, *both)).ravel()
+    if encoders.soil is not None:
+        soil = cast(Soil, _SOIL.apply(encoders.soil, in_rows(semantic)))
     return TerrainFeatures(
         average=jnp.concatenate([jnp.mean(x, axis=over_space) for x in both]),
         reduced=reduced,
-        soil=None if encoders.soil is None else soil_of(encoders.soil, in_rows(semantic)),
+        soil=soil,
         latents=in_rows(jnp.concatenate(both, axis=-1)) if keep else None,
     )
 
@@ -103,11 +105,6 @@ def reduce(weights: Any, elevation: jax.Array, semantic: jax.Array) -> jax.Array
     """Latents `[..., 18]` of each cell to `[..., C]`, without a copy of them beside each other."""
     of_elevation, of_semantic = jnp.split(weights["kernel"], 2)
     return elevation @ of_elevation + semantic @ of_semantic + weights["bias"]
-
-
-def soil_of(weights: Any, semantic: jax.Array) -> Soil:
-    """Semantic latents `[..., 16, 16, 18]` to the soil `[...]` that they look like."""
-    return cast(Soil, _SOIL.apply(weights, semantic, jnp.float32(0)))
 
 
 class _Reducing(nn.Module):

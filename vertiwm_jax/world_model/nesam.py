@@ -111,12 +111,13 @@ class Nesam:
             unit_weight = query.soils(terrain).unit_weight
             terrain = terrain.with_soils(replace(features.soil, unit_weight=unit_weight))
         physics, memory = self._physics(params, vehicle, terrain, history.simulator, state, command)
-        constants = _fixed((params.normalization, params.correction_scale, vehicle))
-        step = StepFeatures.of(*constants, history.physics, state, command, physics, memory)
+        constants, scale, fixed = _fixed((params.normalization, params.correction_scale, vehicle))
+        step = StepFeatures.of(
+            constants, scale, fixed, history.physics, state, command, physics, memory
+        )
         found: Any = self.network.apply(params.network, step.both, None, history.cache)
         outputs, cache = found
-        mean = 0.5 * (outputs[0] + MOTION_SIGNS * outputs[1])
-        correction = _fixed(params.correction_scale) * mean
+        correction = scale * (0.5 * (outputs[0] + MOTION_SIGNS * outputs[1]))
         return motion.corrected(physics, correction), NesamHistory(memory, cache, physics)
 
     @property
