@@ -113,27 +113,20 @@ def turned(twist: Twist, inertia: Vector, turn: Axes) -> Twist:
 
 def _solve_spd(lower: list[list[jax.Array]], rhs: list[jax.Array]) -> list[jax.Array]:
     """Cholesky solution, written out so that XLA fuses it over a batch of small systems."""
-    n = len(rhs)
     factor: list[list[jax.Array]] = []
-    for i in range(n):
+    # The right-hand side as one more row is eliminated with the others.
+    for i, line in enumerate([*lower, rhs]):
         row: list[jax.Array] = []
-        for j in range(i + 1):
-            rest = lower[i][j]
+        for j, rest in enumerate(line):
             for k in range(j):
                 rest = rest - row[k] * (row[k] if i == j else factor[j][k])
             # The diagonal is kept as its reciprocal: it is only ever divided by.
             row.append(jax.lax.rsqrt(rest) if i == j else rest * factor[j][j])
         factor.append(row)
-    forward: list[jax.Array] = []
-    for i in range(n):
-        rest = rhs[i]
-        for k in range(i):
-            rest = rest - factor[i][k] * forward[k]
-        forward.append(rest * factor[i][i])
-    solution = forward
-    for i in reversed(range(n)):
-        rest = forward[i]
-        for k in range(i + 1, n):
+    solution = factor.pop()
+    for i in reversed(range(len(rhs))):
+        rest = solution[i]
+        for k in range(i + 1, len(rhs)):
             rest = rest - factor[k][i] * solution[k]
         solution[i] = rest * factor[i][i]
     return solution
