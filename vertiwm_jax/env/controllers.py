@@ -54,7 +54,7 @@ class LookAhead:
     its far places. The steering is the mean over arcs with weights exp(-cost / spread).
 
     config: of the environment. speed: m/s. reach: wheelbases over which places lose weight.
-    onward: weight of each metre of cost to go. far: stations whose cost to go is used.
+    onward: weight of each meter of cost to go. far: stations whose cost to go is used.
     """
 
     config: NavigationConfig = struct.field(pytree_node=False)

@@ -1,6 +1,5 @@
 """The navigation task as Gymnasium environments: one vehicle, or many at once."""
 
-from functools import partial
 from typing import Any
 
 import gymnasium
@@ -22,21 +21,8 @@ _ENDINGS = np.array([reason.name.lower() for reason in TerminationReason])
 # Equal environments share what these compile.
 _reset = jax.jit(NavigationEnv.reset_env, static_argnums=0)
 _step = jax.jit(NavigationEnv.step_env, static_argnums=0)
-
-
-@partial(jax.jit, static_argnames=("env", "count"))
-def _reset_all(
-    env: NavigationEnv, key: jax.Array, params: TaskParams, count: int
-) -> tuple[jax.Array, TaskState]:
-    return jax.vmap(env.reset, (0, None))(jax.random.split(key, count), params)
-
-
-@partial(jax.jit, static_argnames="env")
-def _step_all(
-    env: NavigationEnv, key: jax.Array, states: TaskState, actions: jax.Array, params: TaskParams
-) -> tuple[Any, ...]:
-    keys = jax.random.split(key, len(actions))
-    return jax.vmap(env.step, (0, 0, 0, None))(keys, states, actions, params)
+_reset_all = jax.jit(jax.vmap(NavigationEnv.reset, (None, 0, None)), static_argnums=0)
+_step_all = jax.jit(jax.vmap(NavigationEnv.step, (None, 0, 0, 0, None)), static_argnums=0)
 
 
 class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -112,8 +98,7 @@ class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Draws new starts for all vehicles from the pool. `options` is not used."""
         super().reset(seed=seed)
         self._key = jax.random.key(self.np_random.integers(2**31))
-        key = self._next_key()
-        observation, self._state = _reset_all(self._env, key, self._params, self.num_envs)
+        observation, self._state = _reset_all(self._env, self._next_keys(), self._params)
         return np.array(observation), {}
 
     def step(
@@ -123,7 +108,7 @@ class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if self._state is None:
             raise gymnasium.error.ResetNeeded("step: call reset() first")
         observation, self._state, *outcome = _step_all(
-            self._env, self._next_key(), self._state, actions, self._params
+            self._env, self._next_keys(), self._state, actions, self._params
         )
         # Copies, since arrays of JAX are read-only.
         reward, terminated, truncated, info = jax.tree.map(np.array, outcome)
@@ -139,16 +124,17 @@ class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             infos |= _with_masks({"final_obs": final, "final_info": _with_masks(info, over)}, over)
         return np.array(observation), reward, terminated, truncated, infos
 
-    def _next_key(self) -> jax.Array:
-        self._key, key = jax.random.split(self._key)
-        return key
+    def _next_keys(self) -> jax.Array:
+        keys = jax.random.split(self._key, self.num_envs + 1)
+        self._key = keys[0]
+        return keys[1:]
 
 
 def _named(info: dict[str, Any]) -> dict[str, Any]:
-    """The same with endings by name, like "goal"."""
+    """The same with the reason of termination by name, like "goal"."""
     return info | {"ending": _ENDINGS[np.asarray(info["ending"])]}
 
 
 def _with_masks(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Gymnasium's form: beside each entry, whose it is."""
+    """Adds Gymnasium's masks: for which environments each entry holds."""
     return info | {f"_{name}": mask.copy() for name in info}

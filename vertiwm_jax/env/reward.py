@@ -13,16 +13,16 @@ from vertiwm_jax.env.termination import TerminationReason
 class RewardConfig:
     """Weights of the reward, in Verti-Bench's shape; penalties are subtracted.
 
-    progress: for each metre by which the cost to go falls.
+    progress: for each meter by which the cost to go falls.
     stalled: for each stalled step.
     tilt: for roll and for pitch beyond `tilt_limit`.
     tilt_limit: roll and pitch that cost nothing, rad.
     vertical: for each m/s of vertical speed, each step.
     goal, stuck, failure: once, at the end; failure is any other terminal ending. Verti-Bench takes
         300 and 600; for more, a detour is worth its time.
-    timed_out, timed_out_distance: once at the time limit, and for each metre left then.
-    disagreement: for each metre by which the specialists of a model disagree, each step.
-    spread: for each metre of spread of its gates, each step.
+    timed_out, timed_out_distance: once at the time limit, and for each meter left then.
+    disagreement: for each meter by which the specialists of a model disagree, each step.
+    spread: for each meter of spread of its gates, each step.
     """
 
     progress: float = 50.0

@@ -38,8 +38,8 @@ class RouteConfig:
 
     cells: number along each side of the map.
     difficulty: how hard ground is to drive on.
-    detour: extra cost of a metre of difficulty 1, in metres of level ground.
-    blocked: extra cost of a metre that touches an obstacle or the edge of the map.
+    detour: extra cost of a meter of difficulty 1, in meters of level ground.
+    blocked: extra cost of a meter that touches an obstacle or the edge of the map.
     """
 
     cells: Annotated[int, Bounds("at least 4", lambda x: x >= 4)] = 64
