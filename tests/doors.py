@@ -19,8 +19,7 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.rl import experiment, policy
 from vertiwm_jax.rl.experiment import TrainConfig
-from vertiwm_jax.rl.learned import DeterministicPolicy
-from vertiwm_jax.rl.policy import Base, Policy, PolicyConfig
+from vertiwm_jax.rl.policy import Base, DeterministicPolicy, Policy, PolicyConfig
 from vertiwm_jax.terrain.map import TerrainMap
 
 Door = Callable[[Sequence[str]], None]

@@ -14,7 +14,7 @@ from vertiwm_jax.deploy import description, onnx_graph, run_policy, stablehlo
 from vertiwm_jax.env.observation import ARCS, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.networks.policy import Actor, ObservationLayout
-from vertiwm_jax.rl.learned import DeterministicPolicy
+from vertiwm_jax.rl.policy import DeterministicPolicy
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 
 

@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ from vertiwm_jax.networks.policy import Actor, ObservationLayout, TanhNormalActo
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.rl.experiment import SACTraining
-from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy
+from vertiwm_jax.rl.policy import DeterministicPolicy
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
@@ -213,7 +214,7 @@ def run_and_policy(tmp_path_factory):
     (run / "config.yaml").write_text(TINY)
     policies = untrained(SACTraining, run)
     config = configuration.load(SACTraining, run / "config.yaml")
-    return run, ResidualPolicy(LookAhead(config.navigation), policies[1])
+    return run, replace(policies[1], base=LookAhead(config.navigation))
 
 
 def test_a_run_is_exported_as_it_is_evaluated(run_and_policy, tmp_path, capsys):

@@ -16,7 +16,6 @@ from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.planning.improvement import ImprovementConfig, PolicyImprovement
-from vertiwm_jax.rl.learned import ResidualPolicy
 
 CONFIG = NavigationConfig(horizon_seconds=15.0)
 KEY = jax.random.key(0)
@@ -58,8 +57,8 @@ def test_without_alternatives_it_drives_as_the_policy_does(blocked):
     for correction in ((0.0, 0.0), (0.1, 0.2)):
         alone = planner(env, correction, candidates=1, decisions=1)
         found = run_episodes(env, params, alone, KEY)
-        held = ResidualPolicy(StraightToGoal(CONFIG), Always(jnp.array(correction)))
-        expected = run_episodes(env, params, held, KEY)
+        led = replace(env, base=StraightToGoal(CONFIG))
+        expected = run_episodes(led, params, Always(jnp.array(correction)), KEY)
         assert int(found.ending[0]) == int(expected.ending[0])
         np.testing.assert_allclose(found.path(0)[0], expected.path(0)[0], atol=1e-3)
 

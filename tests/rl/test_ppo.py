@@ -1,4 +1,5 @@
 import functools
+from dataclasses import replace
 
 import chex
 import jax
@@ -17,7 +18,6 @@ from rl.probes import (
 )
 
 from vertiwm_jax.networks.policy import ObservationLayout
-from vertiwm_jax.rl.learned import ResidualPolicy
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 
 CONFIG = PPOConfig(
@@ -192,6 +192,6 @@ def test_what_has_learned_nothing_leaves_a_controller_as_it_is():
     state = state.replace(params={**state.params, "actor": {"params": still}})
     learned = ppo.policy(state)
     np.testing.assert_array_equal(learned(observations), jnp.zeros((3, 1)))
-    corrected = ResidualPolicy(lambda observation, key: observation / 3, learned)
+    corrected = replace(learned, base=lambda observation, key: observation / 3)
     action = corrected(observations, jax.random.key(1))
     np.testing.assert_allclose(action, [[-1 / 3], [0.1], [1.0]], rtol=1e-6)

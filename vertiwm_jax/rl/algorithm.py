@@ -21,7 +21,7 @@ from vertiwm_jax.networks.policy import (
     ObservationLayout,
     TanhNormalActor,
 )
-from vertiwm_jax.rl.learned import DeterministicPolicy, Value
+from vertiwm_jax.rl.policy import DeterministicPolicy, Value
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.training import Algorithm
 

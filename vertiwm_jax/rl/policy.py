@@ -4,7 +4,7 @@ import io
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, cast
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +20,15 @@ from vertiwm_jax.env.controllers import baselines
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.models.registry import ModelName
-from vertiwm_jax.networks.policy import ActionCritic, Actor, Critic, TanhNormalActor
-from vertiwm_jax.rl.learned import DeterministicPolicy, ResidualPolicy, Value
+from vertiwm_jax.networks.policy import (
+    ActionCritic,
+    Actor,
+    Critic,
+    Gaussian,
+    TanhNormal,
+    TanhNormalActor,
+    twin_values,
+)
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 
 FOLDER = "policy"
@@ -29,6 +36,51 @@ FOLDER = "policy"
 _ACTIONS = 2
 _STATISTICS = "mean", "variance", "count"
 Base = Literal["look ahead", "straight to goal", "none"]
+
+
+@struct.dataclass
+class DeterministicPolicy:
+    """What was learned as it is used: always the mean of what it would draw.
+
+    actor: the network, static; params: its weights.
+    observations: statistics that its observations are normalized by.
+    base: a controller, static, whose actions it corrects; None if it acts by itself.
+    """
+
+    actor: Actor | TanhNormalActor = struct.field(pytree_node=False)
+    params: Any
+    observations: RunningStatistics
+    base: agent.Policy | None = struct.field(pytree_node=False, default=None)
+
+    def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
+        """`[..., O]` observations to `[..., A]` actions in [-1, 1]; the key is of the base."""
+        seen = self.observations.normalize(observation)
+        policy = cast(Gaussian | TanhNormal, self.actor.apply(self.params, seen))
+        key = jax.random.key(0) if key is None else key
+        return agent.corrected(self.base, observation, key, jnp.clip(policy.mean, -1.0, 1.0))
+
+
+@struct.dataclass
+class Value:
+    """The return that a learned policy can expect, as far as it was learned.
+
+    critic: the network, static; params: its weights. A critic of actions has two sets of them, with
+        an axis for both, and the lower value counts.
+    policy: whose return it is; scale: `[]` of the critic's output.
+    """
+
+    critic: Critic | ActionCritic = struct.field(pytree_node=False)
+    params: Any
+    policy: DeterministicPolicy
+    scale: jax.Array
+
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """`[..., O]` observations to `[...]` values, in units of reward."""
+        seen = self.policy.observations.normalize(observation)
+        if isinstance(self.critic, Critic):
+            return self.scale * cast(jax.Array, self.critic.apply(self.params, seen))
+        values = twin_values(self.critic, self.params, seen, self.policy(observation))
+        return self.scale * jnp.min(values, axis=0)
 
 
 @configuration.settings
@@ -95,9 +147,9 @@ class Policy:
         return self.config.navigation
 
     @property
-    def acting(self) -> ResidualPolicy | DeterministicPolicy:
+    def acting(self) -> DeterministicPolicy:
         """What drives: the controller as corrected, or the actor alone."""
-        return self.learned if self.base is None else ResidualPolicy(self.base, self.learned)
+        return replace(self.learned, base=self.base)
 
     def on(self, vehicle: VehicleConfig) -> Self:
         """The same policy with a controller of another vehicle."""
@@ -106,7 +158,7 @@ class Policy:
 
     def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """`[..., O]` observations to `[..., 2]` actions in [-1, 1]; no key is needed."""
-        return self.acting(observation, jax.random.key(0) if key is None else key)
+        return self.acting(observation, key)
 
     def value(self, observation: jax.Array) -> jax.Array:
         """`[..., O]` observations to `[...]` returns that it expects, in units of reward."""
