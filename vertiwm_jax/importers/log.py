@@ -62,8 +62,9 @@ def build(
             _check_finite(f"{name}: {field}", array)
     if len(time) < 2:
         raise DataError(f"{name}: time: expected two poses or more, found one")
-    _check_increasing(f"{name}: time", time)
-    _check_increasing(f"{name}: time of commands", command_time)
+    for field, stamps in (("time", time), ("time of commands", command_time)):
+        wrong = np.diff(stamps, prepend=-np.inf) <= 0
+        _refuse(f"{name}: {field}: expected stamps that increase", wrong, stamps)
     units, frames = settings.units, settings.frames
     meter = settings.vehicle.scale
     second = meter**0.5  # Froude's similarity: gravity is the same at any size.
@@ -112,11 +113,6 @@ def _check_finite(field: str, array: np.ndarray) -> None:
         raise DataError(f"{field}: expected one value or more, found none")
     wrong = ~np.isfinite(array.reshape(len(array), -1)).all(1)
     _refuse(f"{field}: expected finite numbers", wrong, array)
-
-
-def _check_increasing(field: str, stamps: np.ndarray) -> None:
-    wrong = np.diff(stamps, prepend=-np.inf) <= 0
-    _refuse(f"{field}: expected stamps that increase", wrong, stamps)
 
 
 def _refuse(expected: str, wrong: np.ndarray, values: np.ndarray) -> None:

@@ -196,16 +196,9 @@ def fit(
     params, data = jax.device_put((jax.tree.map(jnp.asarray, params), data))
     inputs, algorithm = FitInputs(params, data), Fit(problem, config)
     restored = training.restore(algorithm, inputs, run.folder)
-    state = training.train(
-        algorithm,
-        inputs,
-        key,
-        run,
-        config.updates // config.updates_per_iteration,
-        Work("updates", config.updates_per_iteration, ("loss", "error")),
-        config.checkpoints,
-        restored,
-    )
+    each, kept = config.updates_per_iteration, config.checkpoints
+    iterations, work = config.updates // each, Work("updates", each, ("loss", "error"))
+    state = training.train(algorithm, inputs, key, run, iterations, work, kept, restored)
     fitted = merge(params, state.best)
     if not (run.folder / RESULT / str(config.updates)).is_dir():
         checkpoints.save(run.folder / RESULT, config.updates, fitted, keep=1)
