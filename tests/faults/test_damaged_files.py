@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pyarrow
 import pytest
+import tifffile
 from faults.border import refusal
 from importers.bags import Bag
 from importers.logged import SETTINGS, logged
@@ -145,6 +146,41 @@ def test_what_a_map_holds_may_be_of_another_type(good, case):
     np.savez(good, **arrays | {name: changed(arrays)})
     message = refusal(lambda: files.load_map(good), MapError)
     assert message.startswith(f"{good}: ")
+
+
+def tagged_without_width():
+    stream = io.BytesIO()
+    tifffile.imwrite(stream, np.ones((21, 21), np.float32))
+    data = bytearray(stream.getvalue())
+    with tifffile.TiffFile(io.BytesIO(data)) as file:
+        place = file.pages.first.tags["ImageWidth"].valueoffset
+    struct.pack_into("<H", data, place, 0)
+    return bytes(data)
+
+
+HEIGHTS = {
+    "empty.npy": b"",
+    "header.npy": array(np.ones((21, 21))).replace(b"}", b" ", 1),
+    "cut.tif": b"II*\0\x08\0\0",
+    "thin.tif": tagged_without_width(),
+}
+
+
+@pytest.mark.parametrize("name", HEIGHTS)
+def test_damaged_heights_are_refused(tmp_path, name):
+    (tmp_path / name).write_bytes(HEIGHTS[name])
+    message = refusal(lambda: files.from_heightmap(tmp_path / name, 1.0), MapError)
+    assert message.startswith(f"{tmp_path / name}: elevation: expected")
+
+
+def test_damaged_classes_are_refused(tmp_path):
+    np.save(tmp_path / "heights.npy", np.ones((21, 21)))
+    classes = tmp_path / "classes.npy"
+    classes.touch()
+    message = refusal(
+        lambda: files.from_heightmap(tmp_path / "heights.npy", 1.0, class_image=classes), MapError
+    )
+    assert message.startswith(f"{classes}: class_image: expected")
 
 
 def test_a_checkout_without_worlds_is_refused(tmp_path):

@@ -1,8 +1,10 @@
 """How much memory an input asks for is bounded before any is taken."""
 
 import io
+import struct
 import sys
 import zipfile
+import zlib
 
 import numpy as np
 import pytest
@@ -59,6 +61,11 @@ def claiming(shape):
     return stream.getvalue() + bytes(64)
 
 
+def npy(folder):
+    (folder / "heights.npy").write_bytes(claiming((10**6, 10**6)))
+    return lambda: files.from_heightmap(folder / "heights.npy", 1.0)
+
+
 def npz(folder):
     files.save(TerrainMap.from_array(np.ones((9, 9)), np.full((2, 2), GRASS)), folder / "good.npz")
     with (
@@ -71,6 +78,20 @@ def npz(folder):
     return lambda: files.load_map(folder / "map.npz")
 
 
+def png(folder):
+    def chunk(kind, data):
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    head = struct.pack(">IIBBBBB", 60000, 60000, 16, 0, 0, 0, 0)
+    (folder / "heights.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", b"") + chunk(b"IEND", b"")
+    )
+    return lambda: files.from_heightmap(folder / "heights.png", 1.0, height_range=(0, 9))
+
+
 @pytest.mark.usefixtures("little_memory")
-def test_a_map_that_says_it_is_large_is_refused(tmp_path):
-    assert refusal(npz(tmp_path), MapError).startswith(f"{tmp_path}")
+@pytest.mark.parametrize("make", [npy, npz, png])
+def test_a_file_that_says_it_is_large_is_refused(tmp_path, make):
+    assert refusal(make(tmp_path), MapError).startswith(f"{tmp_path}")

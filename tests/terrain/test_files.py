@@ -1,9 +1,11 @@
 import json
+import sys
 
 import jax
 import numpy as np
 import pytest
 from disks import full_disk
+from PIL import Image
 
 from vertiwm_jax.atomic import WriteError
 from vertiwm_jax.terrain import files
@@ -143,3 +145,69 @@ def test_what_is_no_map_is_named(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(MapError, match=r"empty: folder: expected one .npz map or more"):
         files.load_map(tmp_path / "empty")
+
+
+RAMP = np.linspace(0, 65535, 21 * 31).reshape(21, 31).astype(np.uint16)
+
+
+def test_heightmap_from_a_16_bit_png(tmp_path):
+    Image.fromarray(RAMP).save(tmp_path / "h.png")
+    terrain = files.from_heightmap(tmp_path / "h.png", 0.5, height_range=(1, 9))
+    assert terrain.elevation.shape == (1, 21, 31)
+    np.testing.assert_allclose(terrain.elevation[0], 1 + 8 * (RAMP / 65535), atol=1e-5)
+    np.testing.assert_allclose(terrain.origin, [-7.5, 5])
+    assert (terrain.semantic == STANDARD.names.index("grass")).all()
+
+
+def test_heightmap_in_metres_from_npy_and_geotiff(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    heights = (RAMP / 8000).astype(np.float32)
+    np.save(tmp_path / "h.npy", heights)
+    tifffile.imwrite(tmp_path / "h.tif", heights)
+    for name in ("h.npy", "h.tif"):
+        terrain = files.from_heightmap(tmp_path / name, 2.0, default_class="sand")
+        np.testing.assert_array_equal(terrain.elevation[0], heights)
+        assert (terrain.semantic == 8).all() and not terrain.friction.any()
+
+
+def test_geotiff_without_its_extra_says_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tifffile", None)
+    with pytest.raises(MapError, match=r"h.tif: .*pip install 'vertiwm-jax\[geotiff\]'"):
+        files.from_heightmap(tmp_path / "h.tif", 1.0)
+
+
+def test_class_image_of_ids_or_colours(tmp_path):
+    np.save(tmp_path / "h.npy", np.ones((21, 31)))
+    ids = np.arange(6, dtype=np.uint8).reshape(2, 3) + 3
+    Image.fromarray(ids).save(tmp_path / "ids.png")
+    Image.fromarray(STANDARD.rgb[ids]).save(tmp_path / "rgb.png")
+    Image.fromarray(STANDARD.rgb[ids]).convert("RGBA").save(tmp_path / "rgba.png")
+    for name in ("ids.png", "rgb.png", "rgba.png"):
+        terrain = files.from_heightmap(tmp_path / "h.npy", 1.0, class_image=tmp_path / name)
+        np.testing.assert_array_equal(terrain.semantic[0], ids)
+
+
+def test_a_bad_heightmap_is_named(tmp_path):
+    np.save(tmp_path / "h.npy", np.ones((21, 31)))
+    colours = STANDARD.rgb[np.full((2, 3), 4)]
+    colours[1, 2] = (1, 2, 3)
+    Image.fromarray(colours).save(tmp_path / "rgb.png")
+    ids = np.full((2, 3), 4, np.uint8)
+    ids[0, 1] = 77
+    Image.fromarray(ids).save(tmp_path / "ids.png")
+    (tmp_path / "broken.png").write_text("not a picture")
+    for arguments, message in (
+        ({"class_image": tmp_path / "rgb.png"}, r"rgb.png: .*found \(1, 2, 3\) at row 1, column 2"),
+        (
+            {"class_image": tmp_path / "ids.png"},
+            r"ids.png: classes: .*found 77 .* row 0, column 1",
+        ),
+        ({"class_image": tmp_path / "broken.png"}, r"broken.png: class_image: expected a PNG"),
+        ({"default_class": "lava"}, r"h.npy: classes: expected one of clay.* found 'lava'"),
+        ({"height_range": (0, 4)}, r"h.npy: height_range: expected unsigned .* leave height_range"),
+        ({"resolution": 0.0}, r"h.npy: resolution: .* found 0.0"),
+        ({"path": tmp_path / "rgb.png"}, r"rgb.png: elevation: expected a 2-D array"),
+        ({"path": tmp_path / "no.npy"}, r"no.npy: elevation: .*No such file"),
+    ):
+        with pytest.raises(MapError, match=message):
+            files.from_heightmap(**({"path": tmp_path / "h.npy", "resolution": 1.0} | arguments))

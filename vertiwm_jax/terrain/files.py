@@ -1,4 +1,4 @@
-"""Maps on disk, in the `.npz` layout of the Chrono drives."""
+"""Maps on disk: the `.npz` layout of the Chrono drives, and a user's own height map."""
 
 import io
 import json
@@ -8,10 +8,11 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from PIL import Image
 
 from vertiwm_jax import atomic, froude
 from vertiwm_jax.terrain import query, soil, vertibench
-from vertiwm_jax.terrain.classes import GroundClasses
+from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.map import MapError, TerrainMap, refusing, stack
 from vertiwm_jax.terrain.soil import Soil
 
@@ -25,6 +26,7 @@ _SOIL_FIELDS = {
     "Janosi_shear": ("shear_modulus", 1.0),
     "unit_weight": ("unit_weight", 1.0),
 }
+_NO_DATA = 42113  # GDAL's tag of the value that stands for none
 
 
 def load_map(path: str | Path, *, scale: float = 1.0, obstacles: bool = True) -> TerrainMap:
@@ -88,6 +90,47 @@ def save(terrain: TerrainMap, path: str | Path) -> None:
     atomic.write(path, stream.getvalue())
 
 
+def from_heightmap(
+    path: str | Path,
+    resolution: float,
+    height_range: tuple[float, float] | None = None,
+    class_image: str | Path | None = None,
+    default_class: str = "grass",
+    ground: GroundClasses = STANDARD,
+    origin: tuple[float, float] | None = None,
+) -> TerrainMap:
+    """Makes a map from heights in a 16-bit PNG, `.npy` or GeoTIFF file; row 0 is north.
+
+    Args:
+        path: the file.
+        resolution: m between pixels.
+        height_range: heights in m of the darkest and the brightest integer that a pixel can hold;
+            without it, values are meters.
+        class_image: an 8-bit image of ids, or an RGB image of the palette's colors, over the same
+            extent at any resolution.
+        default_class: all ground, where there is no such image.
+        ground: the classes of ground that ids and colors refer to.
+        origin: x, y of the first pixel, m; the map is centered by default.
+
+    Raises:
+        MapError: a file is missing or malformed; the message names it and the field.
+    """
+    name, heights = str(path), _read_raster(Path(path), "elevation")
+    if height_range is not None:
+        if not np.issubdtype(heights.dtype, np.unsignedinteger):
+            raise MapError(
+                name, "height_range", "unsigned integers to scale", f"dtype {heights.dtype}",
+                "leave height_range out: the values are taken as meters",
+            )  # fmt: skip
+        low, high = height_range
+        heights = low + heights * ((high - low) / np.iinfo(heights.dtype).max)
+    classes = default_class if class_image is None else _read_classes(Path(class_image), ground)
+    name = name if class_image is None else f"{name} with {class_image}"
+    return TerrainMap.from_array(
+        heights, classes, resolution=resolution, origin=origin, ground=ground, name=name
+    )
+
+
 def _load_world(path: Path) -> TerrainMap:
     name = str(path)
     with refusing(name, "file", "an .npz map"), np.load(path, allow_pickle=False) as file:
@@ -132,3 +175,54 @@ def _soil(key: str, values: dict[str, float], name: str) -> Soil:
             "add them, or use the name of a preset",
         )  # fmt: skip
     return Soil(**known)
+
+
+def _read_raster(path: Path, field: str) -> np.ndarray:
+    """The pixels of an image, GeoTIFF or `.npy` file."""
+    with refusing(str(path), field, "a PNG, .npy or GeoTIFF file"):
+        suffix = path.suffix.lower()
+        if suffix == ".npy":
+            return np.load(path, allow_pickle=False)
+        if suffix in (".tif", ".tiff"):
+            return _read_geotiff(path, field)
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB") if image.mode in ("P", "RGBA") else image)
+
+
+def _read_geotiff(path: Path, field: str) -> np.ndarray:
+    try:
+        import tifffile
+    except ImportError:
+        raise MapError(
+            str(path), field, "the package tifffile to read GeoTIFF", "it is not installed",
+            "pip install 'vertiwm-jax[geotiff]'",
+        ) from None  # fmt: skip
+    with tifffile.TiffFile(path) as tiff:
+        page = tiff.pages.first
+        pixels = page.asarray()
+        if page.tags.get(_NO_DATA) and (holes := np.sum(pixels == page.nodata)):
+            found = f"{holes} that are {page.nodata:g}, no data"
+            raise MapError(str(path), field, "a value in every pixel", found, "fill the holes")
+    return pixels
+
+
+def _read_classes(path: Path, classes: GroundClasses) -> np.ndarray:
+    """`[r, c]` class ids from an image of ids or of palette colors."""
+    pixels = _read_raster(path, "class_image")
+    if pixels.ndim == 2:
+        return pixels
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise MapError(str(path), "class_image", "ids or RGB colors", f"shape {pixels.shape}")
+    matches = (pixels[:, :, None] == classes.rgb).all(-1)
+    unknown = np.argwhere(~matches.any(-1))
+    if len(unknown):
+        row, column = unknown[0]
+        palette = ", ".join(
+            f"{n} {tuple(c)}" for n, c in zip(classes.names, classes.rgb.tolist(), strict=True)
+        )
+        found = f"{tuple(pixels[row, column].tolist())} at row {row}, column {column}"
+        raise MapError(
+            str(path), "class_image", f"colors of the palette ({palette})",
+            f"{found} ({len(unknown)} such)", "save it without smoothing or compression loss",
+        )  # fmt: skip
+    return matches.argmax(-1).astype(np.uint8)
