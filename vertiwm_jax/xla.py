@@ -16,6 +16,12 @@ _READ_FLAGS = "from jaxlib import xla_client; xla_client.CompileOptions()"
 _left_out: set[str] = set()
 
 
+def left_out() -> list[str]:
+    """Options that this package asks for and that the installed XLA does not know."""
+    _brief_options()
+    return sorted(_left_out)
+
+
 def add_flags(flags: Mapping[str, int | str]) -> None:
     """Adds flags that are not set yet to `XLA_FLAGS`, which JAX reads when it starts.
 

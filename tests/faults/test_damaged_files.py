@@ -233,4 +233,4 @@ def test_a_byte_anywhere_in_parquet_may_be_wrong(seen, tmp_path):
     }
     path = tmp_path / "drive.parquet"
     parquet.write_table(pyarrow.table(columns), path)
-    anywhere_wrong(path, lambda: table.read_parquet(path, TABLE), 200)
+    anywhere_wrong(path, lambda: table.read(path, TABLE), 200)

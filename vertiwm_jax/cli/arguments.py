@@ -9,11 +9,12 @@ from typing import Any, TypeVar
 import tyro
 
 from vertiwm_jax import config as configuration
+from vertiwm_jax import xla
 
 T = TypeVar("T")
 _CONFIG_HELP = """
 --config NAME or FILE: YAML file that gives the fields below their values, or the name of one that
-comes along.
+comes along. --verbose: say which compiler options the installed JAX does not know.
 """
 
 
@@ -26,7 +27,7 @@ def read(kind: Any, name: str, words: Sequence[str], **options: Any) -> Any:
 
 
 def with_file(cls: type[T], file: str | Path, name: str, words: Sequence[str]) -> T:
-    """Reads a command line: `[--config NAME or FILE] [--resume RUN] [--any.field VALUE]`.
+    """Reads `[--config NAME or FILE] [--resume RUN] [--verbose] [--any.field VALUE]`.
 
     Values come from the YAML file `file`, or from the one that `--config` names, or from the
     configuration of the run to `--resume`; names are those of files that come along. Every field
@@ -36,10 +37,13 @@ def with_file(cls: type[T], file: str | Path, name: str, words: Sequence[str]) -
     first = argparse.ArgumentParser(prog=f"vertiwm {name}", add_help=False, allow_abbrev=False)
     first.add_argument("--config", type=Path)
     first.add_argument("--resume", type=Path)
+    first.add_argument("--verbose", action="store_true")
     asked, fields = first.parse_known_args(words)
     if asked.resume:
         file = asked.resume / "config.yaml"
         fields += ["--resume", str(asked.resume)]
+    if asked.verbose:
+        print(f"compiler options left out: {', '.join(xla.left_out()) or 'none'}", flush=True)
     try:
         return read(
             cls,
