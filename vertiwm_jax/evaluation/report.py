@@ -41,7 +41,7 @@ Results = Mapping[str, NavigationResult]
 CURVES = {
     "episode_return": "return",
     "success": "success",
-    "episode_length": "episode [steps]",
+    "episode_length": "episode [actions]",
     "entropy": "entropy [nats]",
     "value_loss": "value loss",
     "kl": "KL divergence",
