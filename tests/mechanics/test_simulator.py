@@ -230,7 +230,8 @@ def test_soil_slows_a_vehicle_down():
 def test_wongs_wheel_also_stands_and_drives_on_soil(kind):
     wong, soil = replace(PARAMS, contact=BekkerWongParams()), ground(kind=kind)
     standing = drive(soil, at_rest(soil), params=wong)
-    assert loads(standing)[-1].sum() == pytest.approx(WEIGHT, rel=0.01)
+    # In snow, into which it sinks deep, it still bounces by 2 % of its weight.
+    assert loads(standing)[-20:].sum(axis=1).mean() == pytest.approx(WEIGHT, rel=0.01)
     assert standing.history.sinkage[-1].min() > 0
     driven = drive(soil, at_rest(soil, x=-10), 3.0, params=wong)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((standing, driven)))
