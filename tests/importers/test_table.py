@@ -109,7 +109,9 @@ def test_files_that_cannot_be_read_are_named(seen, tmp_path):
     write(path, NAMES[:-1], lines)
     assert message() == f"expected columns steer, found only {', '.join(NAMES[:-1])}"
     write(path, NAMES, [*lines, lines[0][:4]])
-    assert message().endswith(f"at row {len(lines) + 1} with 4 columns")
+    assert message() == f"line {len(lines) + 2}: expected 9 values as in the head, found 4"
+    write(path, NAMES, [[*lines[0], "5"], *lines[1:]])  # such as of a comma within a number
+    assert message() == "line 2: expected 9 values as in the head, found 10"
     write(path, NAMES, [["north", *lines[0][1:]], *lines[1:]])
     assert message().startswith("t: expected numbers: could not convert string to float")
     write(path, NAMES, [[*lines[0][:3], "nan", *lines[0][4:]], *lines[1:]])

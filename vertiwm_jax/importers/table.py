@@ -1,7 +1,6 @@
 """Reads CSV and Parquet files: one row per time stamp, with columns named by the settings."""
 
 import csv
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -40,21 +39,26 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
 def _csv_columns(path: Path, names: Sequence[str]) -> Columns:
     """Columns of a CSV file with a header line, as text."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file, warnings.catch_warnings():
-            head = [name.strip() for name in next(csv.reader(file), [])]
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.reader(file, skipinitialspace=True)
+            head = next(rows, [])
             _check_head(path, names, head)
-            warnings.simplefilter("ignore", UserWarning)  # of a file without rows
-            kind = {"dtype": str, "delimiter": ",", "quotechar": '"', "comments": None}
-            chosen = [head.index(name) for name in names]
-            filled = (line for line in file if line.strip(" ,\t\r\n"))
-            cells = np.loadtxt(filled, **kind, usecols=chosen, ndmin=2)
-    except DataError:
-        raise
-    except (ValueError, csv.Error) as error:
+            places = [head.index(name) for name in names]
+            cells = []
+            for row in rows:
+                if not any(cell.strip() for cell in row):
+                    continue
+                if len(row) != len(head):
+                    raise DataError(
+                        f"{path}: line {rows.line_num}: expected {len(head)} values as in the "
+                        f"head, found {len(row)}"
+                    )
+                cells.append([row[place] for place in places])
+    except (UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path}: expected a CSV file in UTF-8: {error}") from None
-    if not len(cells):
+    if not cells:
         raise DataError(f"{path}: expected rows below the head, found none")
-    return dict(zip(names, cells.T, strict=True))
+    return dict(zip(names, np.array(cells).T, strict=True))
 
 
 def _parquet_columns(path: Path, names: Sequence[str]) -> Columns:
