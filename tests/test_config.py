@@ -149,7 +149,7 @@ OUT_OF_BOUNDS = [
     ({"discount": 1.0}, "discount: expected between 0 and 1, found 1.0"),
     ({"share": 1.5}, "share: expected 0 to 1, found 1.5"),
     ({"noise": -0.5}, "noise: expected at least 0, found -0.5"),
-    ({"names": ()}, "names: expected at least one, found ()"),
+    ({"names": ()}, "names: expected at least one, found none"),
 ]
 
 

@@ -79,7 +79,8 @@ def settings(cls: type[T]) -> type[T]:
         for name, bounds, options in _bounds_of_fields(type(self)):
             value = getattr(self, name)
             if bounds.refuses(value):
-                raise ConfigError(f"{name}: expected {bounds.words}{options}, found {value}")
+                found = "none" if value == () else value
+                raise ConfigError(f"{name}: expected {bounds.words}{options}, found {found}")
         try:
             getattr(self, "check", lambda: None)()
         except ConfigError:

@@ -14,7 +14,7 @@ from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.planning.shooting import Shooting, ShootingConfig
 
-CONFIG = NavigationConfig(horizon_seconds=15.0)
+CONFIG = NavigationConfig(speed_range=(0.0, 6.0), horizon_seconds=15.0)
 KEY = jax.random.key(0)
 SMALL = {"candidates": 8, "improved": 2, "decisions": 4}
 
