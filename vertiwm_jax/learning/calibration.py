@@ -1,6 +1,7 @@
 """Constants of models that are measured on recorded drives before anything is learned."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -84,11 +85,15 @@ def gate_constants(
     """The parameters with the constants of the gates' context, measured on windows."""
     assert params.gate is not None
 
-    def one(window: Windows) -> jax.Array:
+    # All are arguments: with weights of encoders as constants, XLA's programs for CPUs read memory
+    # that nothing has written to (jaxlib 0.10.2 and 0.11.2).
+    @jax.jit
+    @partial(jax.vmap, in_axes=(None, None, 0))
+    def measured(params: VertiWMParams, terrain: TerrainMap, window: Windows) -> jax.Array:
         ground = terrain.select(window.world)
         return teacher_forced(model, params, ground, window, lambda history: history.context)[3]
 
-    context = jax.jit(jax.vmap(one))(windows)
+    context = measured(params, terrain, windows)
     context = context.reshape(-1, context.shape[-1])
     deviation = jnp.std(context, axis=0)
     scale = jnp.where(deviation > _CONSTANT, 1 / jnp.maximum(deviation, _CONSTANT), 0.0)
