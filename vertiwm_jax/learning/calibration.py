@@ -85,8 +85,6 @@ def gate_constants(
     """The parameters with the constants of the gates' context, measured on windows."""
     assert params.gate is not None
 
-    # All are arguments: with weights of encoders as constants, XLA's programs for CPUs read memory
-    # that nothing has written to (jaxlib 0.10.2 and 0.11.2).
     @jax.jit
     @partial(jax.vmap, in_axes=(None, None, 0))
     def measured(params: VertiWMParams, terrain: TerrainMap, window: Windows) -> jax.Array:
