@@ -268,6 +268,12 @@ def test_equal_environments_are_one_static_argument():
     assert hash(NavigationEnv(KinematicBicycle())) == hash(NavigationEnv(KinematicBicycle()))
 
 
+def test_a_patch_must_cover_the_next_footprint():
+    with pytest.raises(ValueError, match="top speed"):
+        config = NavigationConfig(speed_range=(0.0, 60.0))
+        bicycle_env(ground(), task((0.0, 0.0), (30.0, 0.0)), config)
+
+
 def test_a_model_that_cannot_stand_is_named():
     env = NavigationEnv(KinematicBicycle())
     broken = BICYCLE.replace(wheelbase=jnp.float32(jnp.nan))

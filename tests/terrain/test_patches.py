@@ -175,3 +175,11 @@ def test_ground_far_above_or_below_the_vehicle_is_cut_off(terrain):
     for height, expected in ((30.0, -1), (-30.0, 1)):
         found = patches_of(terrain, 0, jnp.array([0.0, 0.0, height]), 0.0)
         np.testing.assert_array_equal(found.elevation, expected)
+
+
+def test_footprint_must_fit_the_patch():
+    patches.footprint_covered(2.4, 8.0)
+    with pytest.raises(ValueError, match=r"12.8 m .* found .*6\.9 m > 6\.4 m; keep the top speed"):
+        patches.footprint_covered(2.4, 45.0)
+    with pytest.raises(ValueError, match="patch"):
+        patches.footprint_covered(float("nan"), 4.0)

@@ -25,7 +25,7 @@ from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
-from vertiwm_jax.terrain import obstacles, query, sensing
+from vertiwm_jax.terrain import obstacles, patches, query, sensing
 from vertiwm_jax.terrain.files import load_map
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -78,6 +78,8 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
                 finite.
         """
         config, vehicle, pool = self.config, vehicle or load_vehicle(), len(tasks.world)
+        reach = float(np.hypot(vehicle.wheelbase, vehicle.track) / 2)
+        patches.footprint_covered(reach, max(map(abs, config.speed_range)))
         sensing.check(config.sensing, terrain)
         validate(tasks, terrain, config.goal_radius, config.map_margin)
         if config.sensing.partial or not settled:

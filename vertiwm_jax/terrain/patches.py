@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vertiwm_jax.config import ConfigError
+from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import _raster
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -88,6 +90,22 @@ def pixels(
     semantic = _raster.classes(terrain, row, column, _raster.cell_index(terrain, row, column))
     palette = terrain.class_rgb / 127.5 - 1
     return elevation, jnp.stack([_raster.gather(c, semantic) for c in palette.T], axis=1)
+
+
+def footprint_covered(wheel_reach: float, top_speed: float) -> None:
+    """Raises `ConfigError` unless a patch covers the wheels of the next pose (Sec. III-A).
+
+    wheel_reach: m from the body origin to the farthest ground a wheel can touch.
+    top_speed: m/s, the largest in any direction.
+    """
+    needed, covered = wheel_reach + top_speed * STEP_SECONDS, PATCH_METERS / 2
+    if not needed <= covered:
+        fastest = (covered - wheel_reach) / STEP_SECONDS
+        raise ConfigError(
+            f"patch: expected {PATCH_METERS} m to cover the wheels of the next pose, found a reach "
+            f"of {wheel_reach:g} m + {top_speed:g} m/s x {STEP_SECONDS:g} s = {needed:g} m "
+            f"> {covered:g} m; keep the top speed below {fastest:g} m/s"
+        )
 
 
 def _image(cells: jax.Array) -> jax.Array:
