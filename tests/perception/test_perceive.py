@@ -126,6 +126,16 @@ def test_batches_are_those_of_one_at_a_time(batch, pairs, latents):
     assert all(other.latents is None for other in found[1:])
 
 
+def test_weights_may_be_constants_of_a_program():
+    terrain, states = world(), places(40)
+
+    def of_all(pairs):
+        return jax.vmap(lambda state: look(pairs, terrain, state))(states)
+
+    expected = jax.jit(of_all)(PAIRS["own"])
+    same(jax.jit(lambda: of_all(PAIRS["own"]))(), expected)
+
+
 @pytest.mark.parametrize("classes", [1, 10])  # no cell has a border in it, or most have
 def test_cells_of_one_color_and_cells_with_borders(classes):
     given = PAIRS["own"], world(classes=classes), places()

@@ -87,28 +87,18 @@ def features(
 
     in_rows: brings cells `[..., c]` that are given in another order to `[16, 16, c]`.
     """
+    over_space = tuple(range(elevation.ndim - 1))
     both, reduced, soil = (elevation, semantic), None, None
     if encoders.reduce is not None:
         reduced = in_rows(reduce(encoders.reduce, *both)).ravel()
     if encoders.soil is not None:
         soil = cast(Soil, _SOIL.apply(encoders.soil, in_rows(semantic)))
     return TerrainFeatures(
-        average=jnp.concatenate([_average(x) for x in both]),
+        average=jnp.concatenate([jnp.mean(x, axis=over_space) for x in both]),
         reduced=reduced,
         soil=soil,
         latents=in_rows(jnp.concatenate(both, axis=-1)) if keep else None,
     )
-
-
-def _average(cells: jax.Array) -> jax.Array:
-    """The mean `[c]` over cells `[..., c]`.
-
-    By a matmul: where weights are constants of a program, XLA's sums of what it has just computed
-    read memory, at times, that nothing has written to (CPUs, jaxlib 0.10.2 and 0.11.2).
-    """
-    rows = cells.reshape(-1, cells.shape[-1])
-    each = jnp.full(len(rows), 1 / len(rows), jnp.float32)
-    return jnp.dot(each, rows, precision="highest")
 
 
 def reduce(weights: Any, elevation: jax.Array, semantic: jax.Array) -> jax.Array:
