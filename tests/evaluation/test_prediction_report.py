@@ -39,11 +39,14 @@ def test_coefficients_are_aligned_where_the_vehicle_crosses_a_border():
 
 
 def test_pictures_of_predictions():
-    path = np.stack([np.arange(5.0), 0.1 * np.arange(5.0)], axis=-1)
-    windows = {f"window {i}": {"recorded": path, "model": 1.1 * path} for i in range(5)}
+    # 10 m along y, and then to the left of that, from a vehicle that heads along y.
+    path, start = np.array([[3.0, 4.0], [3.0, 14.0], [1.0, 14.0]]), np.zeros(12)
+    start[[0, 1, 5]] = 3.0, 4.0, np.pi / 2
+    recorded = prediction_report.ahead(start, path)
+    windows = {f"window {i}": {"recorded": recorded, "model": recorded} for i in range(5)}
     figure = prediction_report.paths(windows)
-    recorded = figure.axes[0].lines[0].get_xydata()
-    np.testing.assert_allclose(recorded, np.stack([-path[:, 1], path[:, 0]], axis=-1))
+    drawn = figure.axes[0].lines[0].get_xydata()
+    np.testing.assert_allclose(drawn, [[0, 0], [0, 10], [-2, 10]], atol=1e-12)
     assert [axes.axison for axes in figure.axes] == [True] * 5 + [False] * 3
     figure.savefig(io.BytesIO())
 

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from vertiwm_jax.evaluation import prediction, wheels
+from vertiwm_jax.evaluation import error_sources, prediction
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.dataset import WheelSignals
@@ -34,7 +34,7 @@ def test(tmp_path_factory):
 
 
 def compared(test, model, params):
-    return wheels.compare(prediction.predict(model, params, test).read.wheels, test)
+    return error_sources.wheels(prediction.predict(model, params, test).read.wheels, test)
 
 
 @pytest.fixture(scope="module")

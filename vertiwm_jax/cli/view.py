@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +11,10 @@ from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import ConfigError, CountOrZero, settings
 from vertiwm_jax.env.suites import Suite
 from vertiwm_jax.errors import UserError, needs
+from vertiwm_jax.evaluation.report import NavigationTest
 from vertiwm_jax.mechanics import vehicle
-from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.models.registry import ModelName, load_model
-from vertiwm_jax.viewing import driven, maps, movie, recorded
+from vertiwm_jax.viewing import drives, maps, movie
 from vertiwm_jax.viewing.scene import Scene
 
 
@@ -55,7 +54,7 @@ class View:
             raise ValueError("movie: is written instead of a recording, leave out output and open")
 
 
-def run(name: str, words: Sequence[str]) -> None:
+def run(name: str, words: list[str]) -> None:
     command = arguments.read(View, name, words)
     if maps.are_maps(command.source):
         print(f"the picture is {maps.draw(command.source, command.output)}")
@@ -96,8 +95,11 @@ def _scene(command: View) -> Scene:
             kind = "a file of drives" if of_run else "a policy"
             raise ConfigError(f"{source}: {name}: is of {kind}")
     if of_run:
-        which = command.suite, command.task or 0, command.seed or 0
-        return driven.load(source, command.model, command.weights, command.vehicle, *which)
-    shown = vehicle.load(command.vehicle or HMMWV).vehicle
+        suites = (command.suite,) if command.suite else ()
+        asked = NavigationTest(source, vehicle=command.vehicle, suites=suites, planning=False)
+        which = command.model, command.weights, command.task or 0, command.seed or 0
+        return drives.of_policy(source, asked, *which)
+    shown = vehicle.load(command.vehicle or vehicle.HMMWV).vehicle
     model = load_model(command.model, command.weights, vehicle=shown)
-    return replace(recorded.load(source, command.drive or 0, command.model, *model), vehicle=shown)
+    scene = drives.recorded(source, command.drive or 0, command.model, *model)
+    return replace(scene, vehicle=shown)

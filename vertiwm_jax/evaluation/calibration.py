@@ -75,26 +75,23 @@ class CalibrationTest:
 class Calibration:
     """A bound on an error e for each level: quantile(level) of e / scale, times the scale.
 
-    intercept, slope: of the scale, m and m per m, over the disagreement in a prediction.
-    scores: sorted ratios of errors to their scales, of the drives that it was measured on.
+    line: the scale, m, over the disagreement in a prediction, m, as of `np.polyfit`.
+    scores: ratios of errors to their scales, of the drives that it was measured on.
     """
 
-    intercept: float
-    slope: float
+    line: np.ndarray
     scores: np.ndarray
 
     @classmethod
     def measure(cls, error: np.ndarray, disagreement: np.ndarray) -> Self:
         """From errors and disagreements `[N]`, m; one bound for all if these are equal."""
-        slope, intercept = 0.0, float(np.mean(error))
-        if np.ptp(disagreement) > 0:
-            slope, intercept = (float(x) for x in np.polyfit(disagreement, error, 1))
-        scale = cls(intercept, slope, np.empty(0)).scale(disagreement)
-        return cls(intercept, slope, np.sort(error / scale))
+        line = np.polyfit(disagreement, error, int(np.ptp(disagreement) > 0))
+        scale = cls(line, np.empty(0)).scale(disagreement)
+        return cls(line, error / scale)
 
     def scale(self, disagreement: np.ndarray) -> np.ndarray:
         """`[N]` m, the scale of errors at disagreements `[N]`, m."""
-        return np.maximum(self.intercept + self.slope * disagreement, _LEAST)
+        return np.maximum(np.polyval(self.line, disagreement), _LEAST)
 
     def bound(self, disagreement: np.ndarray, level: float) -> np.ndarray:
         """`[N]` m, what a share `level` of errors is below at disagreements `[N]`, m."""

@@ -18,7 +18,6 @@ from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.episodes import NavigationResult
 from vertiwm_jax.env.suites import SUITES, GroundConfig, Suite
 from vertiwm_jax.evaluation import external, navigation, report, tables
-from vertiwm_jax.evaluation.external import Arena
 from vertiwm_jax.evaluation.report import Results
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
@@ -48,7 +47,7 @@ class CompareConfig:
 
     rows: tyro.conf.Suppress[tyro.conf.Fixed[Annotated[tuple[Row, ...], AtLeastOne]]]
     """Which policies; in a file only."""
-    simulators: Annotated[tuple[Arena, ...], AtLeastOne] = ("builtin",)
+    simulators: Annotated[tuple[external.Arena, ...], AtLeastOne] = ("builtin",)
     """What they are tested in; Chrono needs PyChrono."""
     suites: tuple[Suite, ...] = tuple(SUITES)
     """Kinds of worlds that they are tested on."""
@@ -106,10 +105,9 @@ def compare(config: CompareConfig) -> str:
         tested = {}
         for simulator in config.simulators:
             groups: dict[str, dict[str, NavigationResult]] = {}
+            where = ground.world_suites, simulator, config.jobs
             for task, policies in drivers:
-                driven = report.drive(
-                    task, terrain, policies, ground.world_suites, simulator, config.jobs
-                )
+                driven = report.drive(task, terrain, policies, *where)
                 for suite, results in driven.items():
                     groups.setdefault(suite, {}).update(results)
             report.write(run.folder / simulator, groups, terrain, first.navigation.goal_radius)
@@ -170,11 +168,9 @@ def markdown(
     for simulator, groups in tested.items():
         rows = []
         for policy in next(iter(groups.values())):
-            spent = next((x for name, x in costs.items() if policy.startswith(name)), None)
-            minutes, rate = "", ""
-            if spent:
-                seconds, steps = spent
-                minutes, rate = f"{seconds / 60:.1f}", f"{steps / seconds:,.0f}"
+            spent = [cost for name, cost in costs.items() if policy.startswith(name)]
+            told = [(f"{seconds / 60:.1f}", f"{steps / seconds:,.0f}") for seconds, steps in spent]
+            minutes, rate = told[0] if told else ("", "")
             row = {"policy": policy, "training [min]": minutes, "steps/s": rate}
             rows.append(row | {suite: _cell(results[policy]) for suite, results in groups.items()})
         sections.append(f"**{simulator}**\n\n{tables.markdown(rows)}")

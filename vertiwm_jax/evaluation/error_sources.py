@@ -1,22 +1,25 @@
-"""Where the prediction error comes from: by speed, slope, ground, belly contact and border."""
+"""Where the prediction error comes from, and the predicted wheels beside the recorded ones."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.evaluation.tables import Row
-from vertiwm_jax.learning.windows import Windows
-from vertiwm_jax.terrain import query
-from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.learning.dataset import WheelSignals
 
 SPEEDS = (0.5, 1.5, 2.5, 3.5)  # m/s
 TILTS = (5.0, 10.0, 20.0)  # deg
 DISTANCES = (1.0, 2.0, 4.0, 8.0)  # m
 _DIRECTIONS = 16
+_QUANTITIES: Mapping[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
+    # Recorded sinkage of a wheel in the air is negative, predicted sinkage is 0.
+    "sinkage, mm": ("wheel_sinkage", lambda depth: 1000 * np.maximum(depth, 0.0)),
+    "speed, rad/s": ("wheel_omega", lambda speed: speed),
+    "force, kN": ("wheel_force", lambda force: np.linalg.norm(force, axis=-1) / 1000),
+}
+"""What is compared of wheels: the signal, and how it is told."""
 
 
 def shares(test: TestWindows, error: np.ndarray) -> list[Row]:
@@ -27,8 +30,8 @@ def shares(test: TestWindows, error: np.ndarray) -> list[Row]:
         error: `[N]` m, position errors after the last step.
 
     Returns:
-        A row for each group: its share of all windows, %, its mean error, m, and its share of the
-        sum of all errors, %.
+        A row for each group, by speed, slope, ground, border and belly contact: its share of all
+        windows, %, its mean error, m, and its share of the sum of all errors, %.
     """
     c = test.windows.context
     state = np.asarray(test.windows.state)
@@ -67,28 +70,51 @@ def _binned(values: np.ndarray, edges: Sequence[float]) -> tuple[list[str], np.n
     return names, np.digitize(values, edges)
 
 
-@jax.jit
-def _classes_around(terrain: TerrainMap, windows: Windows) -> tuple[jax.Array, jax.Array]:
-    """`[N]` class below the last context state, and `[N, 4]` whether soil begins or ends around it.
-
-    The second is told for each of `DISTANCES`.
-    """
-    angle = jnp.arange(_DIRECTIONS) * (2 * jnp.pi / _DIRECTIONS)
-    ring = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-    rings = jnp.asarray(DISTANCES)[:, None, None] * ring
-
-    def one(window: Windows) -> tuple[jax.Array, jax.Array]:
-        world, xy = terrain.select(window.world), window.state[window.context, :2]
-        kind = query.surface(world, xy).semantic
-        around = query.surface(world, xy + rings).semantic
-        return kind, jnp.any(terrain.deformable[around] != terrain.deformable[kind], axis=-1)
-
-    return jax.vmap(one)(windows)
-
-
 def _ground(test: TestWindows) -> tuple[np.ndarray, np.ndarray]:
     """`[N]` class below the vehicle at the start, and distance m to where it is soil or not."""
-    kind, differs = map(np.asarray, _classes_around(test.terrain, test.windows))
+    start = np.asarray(test.windows.state)[:, test.windows.context, :2]
+    angle = np.arange(_DIRECTIONS) * (2 * np.pi / _DIRECTIONS)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    rings = start[:, None, None] + np.array(DISTANCES)[:, None, None] * ring
+    kind, around = test.classes(start), test.classes(rings)
+    soft = np.asarray(test.terrain.deformable)
+    differs = (soft[around] != soft[kind][:, None, None]).any(axis=-1)
     beyond = np.where(differs.any(axis=1), differs.argmax(axis=1), len(DISTANCES))
     # A ring that meets other ground puts the border within it and outside the one before.
     return kind, np.append(DISTANCES, np.inf)[beyond] - 1e-6
+
+
+def wheels(predicted: WheelSignals | None, test: TestWindows) -> list[Row]:
+    """Compares sinkage in soil, speed and force of all wheels after the last step.
+
+    Args:
+        predicted: leaves `[N, K, 4, ...]`; None of a model without wheels.
+        test: the N windows.
+
+    Returns:
+        A row for each quantity and kind of ground: the recorded mean, the mean absolute error, both
+        in the unit of the quantity, and the correlation. Quantities that are not modeled or not
+        recorded have no rows.
+    """
+    rows = []
+    for name, (signal, told) in _QUANTITIES.items():
+        both = [getattr(known, signal, None) for known in (test.windows.wheels, predicted)]
+        if any(values is None for values in both):
+            continue
+        for kind, on in test.of_ground.items():
+            # On rigid ground, and on the rigid side of a border, no wheel sinks.
+            if kind != "deformable" and signal == "wheel_sinkage":
+                continue
+            x, y = (told(np.asarray(values)[on, -1]).ravel() for values in both)
+            with np.errstate(invalid="ignore"):  # A constant correlates with nothing.
+                correlation = float(np.corrcoef(x, y)[0, 1])
+            rows.append(
+                {
+                    "wheels": name,
+                    "ground": kind,
+                    "recorded mean": float(x.mean()),
+                    "mean error": float(np.abs(y - x).mean()),
+                    "correlation": correlation,
+                }
+            )
+    return rows

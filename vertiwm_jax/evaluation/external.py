@@ -62,7 +62,7 @@ def evaluate(
     env, agent = replace(env, dynamics=Followed()), as_agent(agent)
     own = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(params.pool_size))
     shared = jax.device_get((tasks, params, agent, jax.random.key_data(own)))
-    one, driven = partial(_drive, simulator, env, *shared), []
+    one, driven = partial(_drive, simulator, env, shared), []
     with Progress(params.pool_size, "episodes") as progress:
         for episode in mapped(one, range(params.pool_size)):
             driven.append(episode)
@@ -71,15 +71,10 @@ def evaluate(
 
 
 def _drive(
-    simulator: Callable[[TerrainMap], Simulator],
-    env: NavigationEnv,
-    tasks: Tasks,
-    params: TaskParams,
-    agent: Agent,
-    keys: np.ndarray,
-    number: int,
+    simulator: Callable[[TerrainMap], Simulator], env: NavigationEnv, shared: tuple, number: int
 ) -> NavigationResult:
     """Drives one task. Arrays come from and go to host memory, as they pass between processes."""
+    tasks, params, agent, keys = shared
     asked, start = jax.tree.map(lambda x: x[number], (tasks, params.starts))
     params, agent, start = jax.device_put((params, agent, start))
     key = jax.random.wrap_key_data(jnp.asarray(keys[number]))

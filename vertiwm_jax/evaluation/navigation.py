@@ -67,13 +67,16 @@ def summary(result: NavigationResult) -> dict[str, Any]:
         driven: m, mean over all episodes.
         endings: how often each termination reason came, by name.
     """
+    from scipy.stats import binomtest
+
     success, steps = np.asarray(result.success), np.asarray(result.steps)
     successes, seconds = int(success.sum()), np.asarray(result.seconds)[success]
+    interval = binomtest(successes, len(success)).proportion_ci(method="wilson")
     counts = np.bincount(np.asarray(result.ending), minlength=len(TerminationReason))
     return {
         "tasks": len(success),
         "successes": successes,
-        "success_interval": wilson_interval(successes, len(success)),
+        "success_interval": (float(interval.low), float(interval.high)),
         "seconds": float(seconds.mean()) if successes else None,
         "seconds_deviation": float(seconds.std()) if successes else None,
         "abs_roll": float(np.average(result.abs_roll, weights=steps)),
@@ -81,18 +84,6 @@ def summary(result: NavigationResult) -> dict[str, Any]:
         "driven": float(np.mean(result.driven)),
         "endings": {e.name.lower(): int(counts[e]) for e in TerminationReason if counts[e]},
     }
-
-
-def wilson_interval(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
-    """Wilson's score interval of a success rate, 95 % by default.
-
-    Wilson (1927), Probable inference, the law of succession, and statistical inference.
-    """
-    rate = successes / trials
-    middle = rate + z * z / (2 * trials)
-    half = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
-    scale = 1 + z * z / trials
-    return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
 
 
 def format_table(summaries: Mapping[str, Mapping[str, Any]]) -> str:

@@ -67,6 +67,11 @@ def panels(
     return figure
 
 
+def timed(values: ArrayLike, first: int = 0) -> tuple[np.ndarray, ArrayLike]:
+    """Values `[T]` of steps, the first of which is `first`, over their time, s."""
+    return STEP_SECONDS * (first + np.arange(np.size(values))), values
+
+
 def learning_curves(
     metrics: Mapping[str, Mapping[str, Sequence[float]]], x: str, labels: Mapping[str, str]
 ) -> Figure:
@@ -116,9 +121,8 @@ def trajectories(
             for axes, angle in ((roll, rpy[:, 0]), (pitch, rpy[:, 1])):
                 axes.plot(seconds, np.degrees(angle), dash, color=color)
         draw_goal(overhead, goal, goal_radius)
-        roll.set_ylabel("roll [deg], left side up")
-        pitch.set_ylabel("pitch [deg], nose down")
-        pitch.set_xlabel("time [s]")
+        roll.set(ylabel="roll [deg], left side up")
+        pitch.set(ylabel="pitch [deg], nose down", xlabel="time [s]")
         roll.tick_params(labelbottom=False)
         handles, _ = overhead.get_legend_handles_labels()
         handles.sort(key=lambda line: line.get_label() not in drives)

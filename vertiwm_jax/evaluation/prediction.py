@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from vertiwm_jax import geometry
 from vertiwm_jax.dynamics import Dynamics, History, Params, disagreement, spread
@@ -18,10 +19,8 @@ from vertiwm_jax.learning.objectives import open_loop
 from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.mechanics.simulator import SimulatorHistory
 from vertiwm_jax.state import VehicleState
+from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model.alone import AloneHistory
-from vertiwm_jax.world_model.nesam import NesamHistory
-from vertiwm_jax.world_model.verti_wm import VertiWMHistory
 
 MEASURES: dict[str, str] = {
     **dict.fromkeys(("position", "horizontal", "height"), "m"),
@@ -49,13 +48,26 @@ class TestWindows:
     @classmethod
     def of(
         cls, drives: Drives, terrain: TerrainMap, context: int, horizon: int, stride: int
-    ) -> "TestWindows":
+    ) -> Self:
         """All windows of the drives; raises what `windows.index` raises."""
         index = recorded.index(drives, terrain, context, horizon, stride)
         return cls(recorded.gather(drives, index), np.asarray(index.drive), terrain)
 
-    def __len__(self) -> int:
-        return len(self.drive)
+    @property
+    def of_ground(self) -> dict[str, np.ndarray]:
+        """`[N]` which windows are of a kind of ground, for each kind that there is."""
+        ground = np.asarray(self.windows.ground)
+        return {kind: ground == i for i, kind in enumerate(GROUNDS) if (ground == i).any()}
+
+    def classes(self, xy: ArrayLike) -> np.ndarray:
+        """`[N, ...]` class of the ground below points `[N, ..., 2]` of the windows' worlds."""
+        return np.asarray(_classes(self.terrain, self.windows.world, xy))
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0, 0))
+def _classes(terrain: TerrainMap, world: jax.Array, xy: jax.Array) -> jax.Array:
+    return query.surface(terrain.select(world), xy).semantic
 
 
 @dataclass(frozen=True)
@@ -109,13 +121,10 @@ class Reading(NamedTuple):
 
 def modeled_wheels(history: History) -> WheelSignals | None:
     """Wheel states in the history of a model, if it has any; forces are of the last sub-step."""
-    match history:
-        case VertiWMHistory(nesam=specialist) | AloneHistory(specialist=specialist):
-            return modeled_wheels(specialist)
-        case NesamHistory(simulator=memory):
-            return modeled_wheels(memory)
-        case SimulatorHistory(wheel_speed=speed, sinkage=sinkage, force=force):
-            return WheelSignals(wheel_omega=speed, wheel_sinkage=sinkage, wheel_force=force)
+    for part in ("nesam", "specialist", "simulator"):
+        history = getattr(history, part, history)
+    if isinstance(history, SimulatorHistory):
+        return WheelSignals(history.wheel_speed, history.sinkage, history.force)
     return None
 
 
@@ -156,16 +165,10 @@ def absolute_errors(
     pose = jnp.concatenate([predicted.position, predicted.rpy], axis=-1)
     lost = ~jnp.all(jnp.isfinite(pose), axis=(1, 2))
     difference = jnp.where(lost[:, None, None], start, pose) - truth
+    position, horizontal = (jnp.linalg.norm(difference[..., :n], axis=-1) for n in (3, 2))
     turn = jnp.degrees(jnp.abs(geometry.wrap(difference[..., 3:])))
-    errors = {
-        "position": jnp.linalg.norm(difference[..., :3], axis=-1),
-        "horizontal": jnp.linalg.norm(difference[..., :2], axis=-1),
-        "height": jnp.abs(difference[..., 2]),
-        "roll": turn[..., 0],
-        "pitch": turn[..., 1],
-        "yaw": turn[..., 2],
-    }
-    return {name: np.asarray(error) for name, error in errors.items()}, np.asarray(lost)
+    errors = position, horizontal, jnp.abs(difference[..., 2]), *jnp.moveaxis(turn, -1, 0)
+    return dict(zip(MEASURES, map(np.asarray, errors), strict=True)), np.asarray(lost)
 
 
 def evaluate(name: str, dynamics: Dynamics, params: Params, test: TestWindows) -> PredictionErrors:
@@ -179,8 +182,7 @@ def summary(
     """Errors of predictions after `horizon` steps, by default all of them, by kind of ground."""
     errors, lost = absolute_errors(predicted, test)
     horizon = int(horizon or errors["position"].shape[1])
-    ground = np.asarray(test.windows.ground)
-    members = {kind: ground == i for i, kind in enumerate(GROUNDS) if (ground == i).any()}
+    members = test.of_ground
     final = {
         measure: {
             kind: bootstrap(error[rows, horizon - 1], test.drive[rows])

@@ -6,31 +6,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import jax
 import numpy as np
 
 from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, settings
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.evaluation import error_sources, plots, prediction, wheels
-from vertiwm_jax.evaluation.prediction import (
-    BATCH,
-    MEASURES,
-    Predicted,
-    PredictionErrors,
-    TestWindows,
-)
+from vertiwm_jax.evaluation import error_sources, plots, prediction
+from vertiwm_jax.evaluation.prediction import MEASURES, Predicted, PredictionErrors, TestWindows
 from vertiwm_jax.evaluation.tables import csv_text, markdown, write
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
-from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.models.config import SoilSource
 from vertiwm_jax.models.registry import ModelName, load_fitted, load_model
 from vertiwm_jax.runs import Progress
-from vertiwm_jax.state import STEP_SECONDS
-from vertiwm_jax.terrain import query
-from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.fusion import COEFFICIENTS
 
 if TYPE_CHECKING:
@@ -53,7 +41,7 @@ class PredictionTest:
     """The models."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
-    vehicle: str = HMMWV
+    vehicle: str = vehicle.HMMWV
     """What the built-in simulator and the bicycle drive: the name of a vehicle that comes along, or
     a YAML file of one."""
     soil: SoilSource | None = None
@@ -89,7 +77,7 @@ class PredictionTest:
         with Progress(len(models), "models") as progress:
             for name, model in models.items():
                 predicted[name] = prediction.predict(*model, test)
-                progress.advance(1, f"{name}, {len(test):,} windows")
+                progress.advance(1, f"{name}, {len(test.drive):,} windows")
         errors = [
             [prediction.summary(name, x.states, test, steps) for name, x in predicted.items()]
             for steps in sorted(self.horizon)
@@ -113,12 +101,12 @@ def _files(
     name, (states, read) = next(iter(predicted.items()))
     error = prediction.absolute_errors(states, test)[0]["position"][:, -1]
     tables = [prediction.format_table(rows, measure) for rows in errors for measure in MEASURES]
-    tables.append(f"Position error of {name}, where it is")
-    tables.append(markdown(error_sources.shares(test, error)))
-    if of_wheels := wheels.compare(read.wheels, test):
+    shares = markdown(error_sources.shares(test, error))
+    tables += [f"Position error of {name}, where it is", shares]
+    if of_wheels := error_sources.wheels(read.wheels, test):
         steps = states.position.shape[1]
-        tables.append(f"Wheels of {name} after {steps} steps, beside those recorded")
-        tables.append(markdown(of_wheels))
+        title = f"Wheels of {name} after {steps} steps, beside those recorded"
+        tables += [title, markdown(of_wheels)]
     yield "prediction.md", "\n\n".join(tables) + "\n"
     yield "prediction.csv", csv_text([row for rows in errors for row in prediction.csv_rows(rows)])
     yield "prediction.png", error_growth({row.name: row.growth for row in errors[-1]})
@@ -129,39 +117,28 @@ def _files(
 
 def _chosen(
     test: TestWindows, error: np.ndarray, predicted: Mapping[str, Predicted]
-) -> dict[str, dict[str, np.ndarray]]:
+) -> dict[str, plots.Curves]:
     """On every kind of ground, windows that are predicted well to badly, for `paths`."""
-    c, ground = test.windows.context, np.asarray(test.windows.ground)
-    state = np.asarray(test.windows.state)
+    c, state = test.windows.context, np.asarray(test.windows.state)
     lines = {"recorded": state[:, c:, :2]}
     for name, (states, _) in predicted.items():
         lines[name] = np.concatenate([state[:, c, None, :2], states.position[..., :2]], axis=1)
     chosen = {}
-    for kind in np.unique(ground):
-        found = np.flatnonzero(ground == kind)
+    for kind, members in test.of_ground.items():
+        found = np.flatnonzero(members)
         ordered = found[np.argsort(error[found])]
         for share in SHARES:
             row = ordered[int(share * (len(ordered) - 1))]
-            title = f"{GROUNDS[kind]}: {share:.0%} below {error[row]:.2f} m"
-            chosen[title] = {name: _ahead(state[row, c], path[row]) for name, path in lines.items()}
+            title = f"{kind}: {share:.0%} below {error[row]:.2f} m"
+            chosen[title] = {name: ahead(state[row, c], path[row]) for name, path in lines.items()}
     return chosen
 
 
-def _ahead(start: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """`[T, 2]` m forward and to the left of where a vehicle `[12]` stood."""
+def ahead(start: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far to the right and forward of where a vehicle `[12]` stood a path `[T, 2]` is, m."""
     cos, sin = np.cos(start[5]), np.sin(start[5])
-    return (path - start[:2]) @ np.array([[cos, -sin], [sin, cos]])
-
-
-@jax.jit
-def _on_soil(terrain: TerrainMap, windows: Windows) -> jax.Array:
-    """`[N, K + 1]` whether there is soil below the recorded vehicle."""
-
-    def one(window: Windows) -> jax.Array:
-        world, xy = terrain.select(window.world), window.state[window.context :, :2]
-        return terrain.deformable[query.surface(world, xy).semantic]
-
-    return jax.lax.map(one, windows, batch_size=BATCH)
+    x, y = (path - start[:2]).T
+    return sin * x - cos * y, cos * x + sin * y
 
 
 def crossings(test: TestWindows, alphas: np.ndarray) -> dict[str, np.ndarray]:
@@ -176,7 +153,8 @@ def crossings(test: TestWindows, alphas: np.ndarray) -> dict[str, np.ndarray]:
     Returns:
         `[2 AROUND + 1, C]` for each direction, NaN where no window reaches.
     """
-    soft = np.asarray(_on_soil(test.terrain, test.windows))
+    driven = test.windows.state[:, test.windows.context :, :2]
+    soft = np.asarray(test.terrain.deformable)[test.classes(driven)]
     changed = soft[:, 1:] != soft[:, :-1]
     padded = np.pad(alphas, [(0, 0), (AROUND, AROUND), (0, 0)], constant_values=np.nan)
     traces = {}
@@ -195,28 +173,18 @@ def error_growth(growth: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
     growth: by model and then by kind, m after each step.
     """
     shown = {
-        kind: {
-            name: (STEP_SECONDS * (1 + np.arange(len(of[kind]))), of[kind])
-            for name, of in growth.items()
-        }
+        kind: {name: plots.timed(of[kind], 1) for name, of in growth.items()}
         for kind in next(iter(growth.values()))
     }
     return plots.panels(shown, "time [s]", "position error [m]", sharey=True, yscale="log")
 
 
-def paths(windows: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
-    """Paths seen from above, a panel for each window: `[T, 2]` m by name, by the panel's title.
-
-    x is forward, drawn upwards, and y to the left. The first of each panel is the recorded one.
-    """
-    shown = {
-        title: {name: (-path[:, 1], path[:, 0]) for name, path in lines.items()}
-        for title, lines in windows.items()
-    }
+def paths(windows: Mapping[str, plots.Curves]) -> Figure:
+    """Paths seen from above, of `ahead`, a panel for each window; the first is the recorded one."""
     ends = {"marker": "s", "markersize": 3.5, "markevery": [-1]}
     labels = "to the right [m]", "forward [m]"
     return plots.panels(
-        shown, *labels, first=-1, line_style=ends, aspect="equal", adjustable="datalim"
+        windows, *labels, first=-1, line_style=ends, aspect="equal", adjustable="datalim"
     )
 
 
@@ -227,10 +195,8 @@ def coefficients(traces: Mapping[str, np.ndarray]) -> Figure:
     """
     shown = {}
     for title, trace in traces.items():
-        seconds = STEP_SECONDS * (np.arange(len(trace)) - len(trace) // 2)
-        shown[title] = {
-            name: (seconds, values) for name, values in zip(COEFFICIENTS, trace.T, strict=True)
-        }
+        curves = [plots.timed(values, -(len(trace) // 2)) for values in trace.T]
+        shown[title] = dict(zip(COEFFICIENTS, curves, strict=True))
     labels = "time since the crossing [s]", "0 Transformer, 1 NeSAM"
     figure = plots.panels(shown, *labels, sharey=True)
     for axes in figure.axes:

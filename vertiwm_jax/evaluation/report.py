@@ -21,10 +21,7 @@ from vertiwm_jax.env.episodes import NavigationResult, run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.suites import Suite, test_tasks
 from vertiwm_jax.env.termination import TerminationReason
-from vertiwm_jax.evaluation import external, navigation, plots
-from vertiwm_jax.evaluation.external import Arena
-from vertiwm_jax.evaluation.tables import Row, csv_text
-from vertiwm_jax.evaluation.tables import write as write_files
+from vertiwm_jax.evaluation import external, navigation, plots, tables
 from vertiwm_jax.planning.improvement import ImprovementConfig
 from vertiwm_jax.planning.mppi import MPPI, MPPIConfig
 from vertiwm_jax.planning.shooting import Shooting, ShootingConfig
@@ -67,7 +64,7 @@ class NavigationTest:
     """The same of planning by gradients."""
     planning: bool | None = None
     """Whether the policy of a run drives a second time, planning; by default as its run says."""
-    simulator: Arena = "builtin"
+    simulator: external.Arena = "builtin"
     """What moves the vehicle; Chrono needs PyChrono, and moves one in each process."""
     jobs: Count = 1
     """Processes that drive, in Chrono."""
@@ -110,8 +107,8 @@ class NavigationTest:
         config = self.changed(trained)
         external.expect(self.simulator, config)
         if self.terrain:
-            scale, obstacles = config.driven.scale, config.ground.obstacles
-            terrain = files.load_map(self.terrain, scale=scale, obstacles=obstacles)
+            scale = config.driven.scale
+            terrain = files.load_map(self.terrain, scale=scale, obstacles=self.obstacles)
         else:
             terrain = experiment.held_out(config)
         policies = dict(config.baselines)
@@ -123,8 +120,7 @@ class NavigationTest:
             policies = {REFERENCE: policies[REFERENCE]}
         elif self.policy != "random":
             policies = {str(self.policy): self._planner(config)} | policies
-        where = terrain, policies, config.world_suites
-        groups = drive(config, *where, self.simulator, self.jobs)
+        groups = drive(config, terrain, policies, config.world_suites, self.simulator, self.jobs)
         if self.output:
             write(self.output, groups, terrain, config.navigation.goal_radius)
         return markdown(groups)
@@ -135,9 +131,7 @@ class NavigationTest:
         ground = {name: value for name, value in asked.items() if value}
         asked = {name: getattr(self, name) for name in ("terrain", "vehicle", "seed")}
         changes = {name: value for name, value in asked.items() if value is not None}
-        if self.terrain:
-            ground["obstacles"] = self.obstacles
-        elif self.suites or self.seed is not None:
+        if self.suites or self.seed is not None:
             changes["terrain"] = None
         if self.sensing_range is not None:
             sensing = replace(config.navigation.sensing, range=self.sensing_range)
@@ -149,12 +143,9 @@ class NavigationTest:
 
     def _planner(self, config: TrainConfig) -> Agent:
         by_gradients = self.policy == "shooting"
-        model = (self.shooting if by_gradients else self.mppi).model
-        dynamics, weights = experiment.dynamics(config, model, by_gradients)
-        env = NavigationEnv(dynamics, config.navigation)
-        if by_gradients:
-            return Shooting(env=env, dynamics=weights, config=self.shooting)
-        return MPPI(env=env, dynamics=weights, config=self.mppi)
+        kind, settings = Shooting if by_gradients else MPPI, getattr(self, str(self.policy))
+        dynamics, weights = experiment.dynamics(config, settings.model, by_gradients)
+        return kind(NavigationEnv(dynamics, config.navigation), weights, settings)
 
 
 def after_training(trained: Trained) -> str:
@@ -180,7 +171,7 @@ def drive(
     terrain: TerrainMap,
     policies: Mapping[str, Policy | Agent],
     suites: Sequence[str] | None,
-    simulator: Arena = "builtin",
+    simulator: external.Arena = "builtin",
     jobs: int = 1,
 ) -> dict[str, Results]:
     """Drives all tasks of a test with each policy.
@@ -215,11 +206,14 @@ def drive(
 
 
 def by_suite(results: Results, suites: Sequence[str]) -> dict[str, Results]:
-    """Splits the episodes of each policy by the suite of their world, of `suites` `[W]`."""
+    """Splits the episodes of each policy by the suite of their world, of `suites` `[W]`.
+
+    They are in host memory then.
+    """
 
     def part(result: NavigationResult, suite: str) -> NavigationResult:
         rows = np.array(suites)[np.asarray(result.world)] == suite
-        return jax.tree.map(lambda x: x[rows], result)
+        return jax.tree.map(lambda x: np.asarray(x)[rows], result)
 
     return {
         suite: {policy: part(result, suite) for policy, result in results.items()}
@@ -233,8 +227,9 @@ def write(
     """`summary.md`, `summary.json`, `episodes.csv`, and a picture of a hard task of each suite."""
     drawn = {}
     for name, results in groups.items():
-        hard = _hard_task(results)
+        # The first task that straight to goal fails, better one that the first policy solves.
         first = next(iter(results.values()))
+        hard = int(np.argmax(2 * ~results[REFERENCE].success + first.success))
         paths = {policy: result.path(hard) for policy, result in results.items()}
         goal = np.asarray(first.goal[hard]), goal_radius
         figure = plots.trajectories(terrain, int(first.world[hard]), paths, *goal)
@@ -242,9 +237,9 @@ def write(
     texts = {
         "summary.md": markdown(groups) + "\n",
         "summary.json": json.dumps(summary(groups), indent=2) + "\n",
-        "episodes.csv": csv_text(_episodes(groups)),
+        "episodes.csv": tables.csv_text(_episodes(groups)),
     }
-    write_files(folder, texts | drawn)
+    tables.write(folder, texts | drawn)
 
 
 def markdown(groups: Mapping[str, Results]) -> str:
@@ -267,21 +262,16 @@ def markdown(groups: Mapping[str, Results]) -> str:
 
 def summary(groups: Mapping[str, Results]) -> dict[str, dict[str, dict[str, Any]]]:
     """The same as plain numbers, for JSON; what has no value is None."""
-    return {
-        suite: {
-            policy: {
-                **navigation.summary(result),
-                "solved_of_reference_failures": int(
-                    np.sum(np.asarray(result.success) & ~np.asarray(results[REFERENCE].success))
-                ),
-            }
-            for policy, result in results.items()
-        }
-        for suite, results in groups.items()
-    }
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for suite, results in groups.items():
+        failed, found[suite] = ~results[REFERENCE].success, {}
+        for policy, result in results.items():
+            solved = {"solved_of_reference_failures": int(np.sum(result.success & failed))}
+            found[suite][policy] = navigation.summary(result) | solved
+    return found
 
 
-def _episodes(groups: Mapping[str, Results]) -> list[Row]:
+def _episodes(groups: Mapping[str, Results]) -> list[tables.Row]:
     """A row for each episode."""
     return [
         {
@@ -298,14 +288,6 @@ def _episodes(groups: Mapping[str, Results]) -> list[Row]:
             "final_distance_m": float(result.final_distance[i]),
         }
         for suite, results in groups.items()
-        for policy, device in results.items()
-        for result in [jax.device_get(device)]
+        for policy, result in results.items()
         for i in range(len(result.ending))
     ]
-
-
-def _hard_task(results: Results) -> int:
-    """The first task that straight to goal fails, better one that the first policy solves."""
-    failed = ~np.asarray(results[REFERENCE].success)
-    solved = np.asarray(next(iter(results.values())).success)
-    return int(np.argmax(2 * failed + solved))

@@ -32,7 +32,8 @@ def write(folder: Path, files: Mapping[str, str | Figure]) -> None:
 
 def markdown(rows: Sequence[Row]) -> str:
     """Rows with equal keys as a Markdown table with aligned columns; floats have three digits."""
-    cells = [list(rows[0]), *([_cell(value) for value in row.values()] for row in rows)]
+    told = [[f"{x:.3g}" if isinstance(x, float) else f"{x}" for x in row.values()] for row in rows]
+    cells = [list(rows[0]), *told]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     cells.insert(1, ["-" * width for width in widths])
     lines = (" | ".join(map(str.ljust, row, widths)) for row in cells)
@@ -46,7 +47,3 @@ def csv_text(rows: Sequence[Row]) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return table.getvalue()
-
-
-def _cell(value: str | float) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)

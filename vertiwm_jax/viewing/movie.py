@@ -131,9 +131,8 @@ def _draw_map(axes: Axes, scene: Scene) -> Show:
         pose = Affine2D().rotate(yaw).translate(x, y) + axes.transData
         for part in body:
             part.set_transform(pose)
-        for wheel, at, turn in zip(
-            wheels, vehicle.wheel_position, scene.steering[step], strict=True
-        ):
+        turned = zip(wheels, vehicle.wheel_position, scene.steering[step], strict=True)
+        for wheel, at, turn in turned:
             wheel.set_transform(Affine2D().rotate(turn).translate(*at) + pose)
         for line in (behind, path):
             line.set_data(*scene.state[: step + 1, :2].T)

@@ -30,15 +30,10 @@ def write(scene: Scene, path: Path) -> None:
 
 def _layout(scene: Scene) -> rrb.Blueprint:
     """The world, seen from behind the vehicle, over the map and the plots."""
-    yaw = scene.state[0, 5]
-    eye = scene.state[0, :3] + np.array([-12 * np.cos(yaw), -12 * np.sin(yaw), 7.0])
-    world = rrb.Spatial3DView(
-        origin="world",
-        name=scene.title,
-        eye_controls=rrb.EyeControls3D(
-            position=eye, look_target=scene.state[0, :3], tracking_entity="world/vehicle"
-        ),
-    )
+    start, yaw = scene.state[0, :3], scene.state[0, 5]
+    eye = start + np.array([-12 * np.cos(yaw), -12 * np.sin(yaw), 7.0])
+    controls = rrb.EyeControls3D(position=eye, look_target=start, tracking_entity="world/vehicle")
+    world = rrb.Spatial3DView(origin="world", name=scene.title, eye_controls=controls)
     over_time = [
         rrb.TimeSeriesView(origin=_entity("plots", title), name=title) for title in panels(scene)
     ]
@@ -60,9 +55,8 @@ def _ground(stream: rr.RecordingStream, scene: Scene) -> None:
     u, v = np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, rows))
     x, y = west + u * (east - west), north - v * (north - south)
     # The corners of each cell: north-west, north-east, south-west, south-east.
-    number = np.arange(rows * columns).reshape(rows, columns)
-    lower, upper = slice(1, None), slice(None, -1)
-    nw, ne, sw, se = (number[i, j].ravel() for i in (upper, lower) for j in (upper, lower))
+    nw = np.arange(rows * columns).reshape(rows, columns)[:-1, :-1].ravel()
+    ne, sw, se = nw + 1, nw + columns, nw + columns + 1
     mesh = rr.Mesh3D(
         vertex_positions=np.stack([x, y, elevation], axis=-1).reshape(-1, 3),
         triangle_indices=np.stack([nw, sw, ne, ne, sw, se], axis=-1).reshape(-1, 3),

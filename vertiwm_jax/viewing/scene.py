@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 
-import jax
 import numpy as np
 
 from vertiwm_jax.learning.dataset import WheelSignals
@@ -62,7 +61,7 @@ class Scene:
     goal: np.ndarray | None = None
     goal_radius: float = 0.0
     prediction: Prediction | None = None
-    vehicle: Vehicle = field(default_factory=lambda: jax.device_get(load_vehicle()))
+    vehicle: Vehicle = field(default_factory=load_vehicle)
 
     @property
     def steps(self) -> int:
@@ -103,11 +102,9 @@ class Scene:
 
 def panels(scene: Scene) -> Panels:
     """Time series to plot, `[T + 1]` by panel title and name; NaN where a value is unknown."""
+    roll, pitch = np.degrees(scene.state[:, 3:5]).T
     shown: Panels = {
-        TILT: {
-            "roll": np.degrees(scene.state[:, 3]),
-            "pitch": np.degrees(scene.state[:, 4]),
-        },
+        TILT: {"roll": roll, "pitch": pitch},
         "speed [m/s]": {"driven": scene.state[:, 6], "commanded": scene.commanded[:, 0]},
     }
     alpha, prediction = scene.coefficients, scene.prediction
