@@ -3,14 +3,13 @@
 import dataclasses
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 import vertiwm_jax
+from vertiwm_jax.checkpoints import named_leaves
 from vertiwm_jax.env import observation
 from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, ObservationSpec
-from vertiwm_jax.env.traversability import TraversabilityCost
 from vertiwm_jax.networks.policy import TanhNormalActor
 from vertiwm_jax.rl import running_statistics
 from vertiwm_jax.rl.policy import Policy
@@ -62,8 +61,7 @@ def about(policy: Policy) -> dict[str, Any]:
 def weights(policy: Policy) -> dict[str, np.ndarray]:
     """Float32 weights of the actor by layer, and `mean` and `std` `[O]` of observations."""
     learned = policy.learned
-    leaves = jax.tree.leaves_with_path(learned.params["params"])
-    named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    named = named_leaves(learned.params["params"])
     named.pop("log_std", None)  # Only exploration needs it.
     named |= {"mean": learned.observations.mean, "std": learned.observations.std}
     return {name: np.asarray(leaf, np.float32) for name, leaf in named.items()}
@@ -71,9 +69,5 @@ def weights(policy: Policy) -> dict[str, np.ndarray]:
 
 def _numbers(base: Any) -> dict[str, Any]:
     """The settings of a controller, but for those of environment and vehicle."""
-    own = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
-    return {
-        name: dataclasses.asdict(value) if isinstance(value, TraversabilityCost) else value
-        for name, value in own.items()
-        if name not in ("config", "steering_limit")
-    }
+    own = dataclasses.asdict(base)
+    return {name: own[name] for name in own if name not in ("config", "steering_limit")}

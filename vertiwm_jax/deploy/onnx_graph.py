@@ -19,7 +19,6 @@ _OPERATORS = {
     np.divide: "Div",
     np.matmul: "MatMul",
     np.maximum: "Max",
-    np.minimum: "Min",
     np.negative: "Neg",
     np.absolute: "Abs",
     np.tanh: "Tanh",
@@ -44,13 +43,8 @@ def record(function: Callable[[Any], Any], inputs: int, outputs: int) -> bytes:
     def batch_of(name: str, size: int) -> onnx.ValueInfoProto:
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
 
-    made = helper.make_graph(
-        graph.nodes,
-        "policy",
-        [batch_of("observation", inputs)],
-        [batch_of(result.name, outputs)],
-        graph.constants,
-    )
+    ends = [batch_of("observation", inputs)], [batch_of(result.name, outputs)]
+    made = helper.make_graph(graph.nodes, "policy", *ends, graph.constants)
     opset = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(made, opset_imports=opset, ir_version=IR_VERSION)
     checker.check_model(model, full_check=True)
@@ -90,11 +84,11 @@ class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any) -> "Recorded":
         """Records an element-wise function."""
-        add, floats = self.graph.add, [_as_float(x) for x in inputs]
+        floats = [_as_float(x) for x in inputs]
         if method != "__call__":
             return NotImplemented
         if ufunc in _OPERATORS:
-            return add(_OPERATORS[ufunc], *floats)
+            return self.graph.add(_OPERATORS[ufunc], *floats)
         if ufunc is np.square:
             return floats[0] * floats[0]
         if ufunc is np.arctan2:

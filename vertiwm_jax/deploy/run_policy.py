@@ -131,7 +131,8 @@ def _look_ahead(about: About, observation: np.ndarray) -> np.ndarray:
 
 def _straight_to_goal(about: About, observation: np.ndarray) -> np.ndarray:
     """Steers straight to the goal and ignores the ground."""
-    return _action(about, about["base"]["gain"] * _bearing(about, observation))
+    towards = _part(about, observation, "goal bearing")
+    return _action(about, about["base"]["gain"] * np.arctan2(towards[:, 1], towards[:, 0]))
 
 
 def _action(about: About, steering: np.ndarray) -> np.ndarray:
@@ -140,12 +141,6 @@ def _action(about: About, steering: np.ndarray) -> np.ndarray:
     speed = (about["base"]["speed"] - low) / (high - low) * 2 - 1
     steering = (steering / about["action"]["steering_limit"])[:, None]
     return np.clip(steering * _float32([0, 1]) + _float32([speed, 0]), -1, 1)
-
-
-def _bearing(about: About, observation: np.ndarray) -> np.ndarray:
-    """`[B]` rad to the goal, left positive."""
-    towards = _part(about, observation, "goal bearing")
-    return np.arctan2(towards[:, 1], towards[:, 0])
 
 
 def _arcs(about: About, observation: np.ndarray, name: str) -> np.ndarray:

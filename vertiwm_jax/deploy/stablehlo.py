@@ -1,11 +1,13 @@
 """JAX functions as StableHLO files, which `jax.export.deserialize` reads without this package."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import export
 
 from vertiwm_jax.env import observation
@@ -15,7 +17,6 @@ from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.state import VehicleState
-from vertiwm_jax.terrain.classes import STANDARD
 from vertiwm_jax.terrain.map import TerrainMap
 
 PLATFORMS = ("cpu", "cuda")
@@ -67,30 +68,19 @@ def _terrain(*arrays: jax.Array) -> TerrainMap:
     arrays: elevation, semantic, friction, obstacles, origin and resolution, as `TerrainMap`
         describes them.
     """
-    elevation, semantic, friction, obstacles, origin, resolution = arrays
-    return TerrainMap(
-        elevation=elevation[None],
-        semantic=semantic[None],
-        friction=friction[None],
-        obstacles=obstacles[None],
-        origin=origin,
-        resolution=resolution,
-        class_rgb=jnp.asarray(STANDARD.rgb),
-        deformable=jnp.asarray(STANDARD.deformable),
-        soils=jax.tree.map(lambda leaf: leaf[None], STANDARD.stacked_soils()),
-        world=jnp.int32(0),
-        class_names=STANDARD.names,
-    )
+    *rasters, origin, resolution = arrays
+    names = "elevation", "semantic", "friction", "obstacles"
+    changes = {name: raster[None] for name, raster in zip(names, rasters, strict=True)}
+    with jax.ensure_compile_time_eval():  # Checks look at its values.
+        flat = TerrainMap.from_array(np.zeros((2, 2)))
+    return replace(flat, **changes, origin=origin, resolution=resolution)
 
 
 def _map_arrays() -> tuple[jax.ShapeDtypeStruct, ...]:
     """The arguments of `_terrain`, for maps of any size."""
-    rows, columns, cell_rows, cell_columns, boxes = export.symbolic_shape(
-        "rows, columns, cell_rows, cell_columns, boxes"
-    )
-    classes = jax.ShapeDtypeStruct((cell_rows, cell_columns), jnp.uint8)
-    friction, obstacles = _floats(cell_rows, cell_columns), _floats(boxes, 5)
-    return _floats(rows, columns), classes, friction, obstacles, _floats(2), _floats()
+    *vertices, r, c, boxes = export.symbolic_shape("R, C, r, c, N")
+    classes = jax.ShapeDtypeStruct((r, c), jnp.uint8)
+    return _floats(*vertices), classes, _floats(r, c), _floats(boxes, 5), _floats(2), _floats()
 
 
 def _floats(*shape: Any) -> jax.ShapeDtypeStruct:
