@@ -2,7 +2,6 @@
 
 import argparse
 import inspect
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,15 +17,15 @@ comes along. --verbose: say which compiler options the installed JAX does not kn
 """
 
 
-def read(kind: Any, name: str, words: Sequence[str], **options: Any) -> Any:
-    """Reads `words` into one of the dataclasses that `kind`, a type or a union, names.
+def read(kind: Any, name: str, words: list[str], **options: Any) -> Any:
+    """Reads `words` into one of the dataclasses of `kind`, or calls that with them if a function.
 
     Bad input ends the process with status 2 and an error that names the option.
     """
     return tyro.cli(kind, args=words, prog=f"vertiwm {name}", **options)
 
 
-def with_file(cls: type[T], file: str | Path, name: str, words: Sequence[str]) -> T:
+def with_file(cls: type[T], file: str | Path, name: str, words: list[str]) -> T:
     """Reads `[--config NAME or FILE] [--resume RUN] [--verbose] [--any.field VALUE]`.
 
     Values come from the YAML file `file`, or from the one that `--config` names, or from the

@@ -1,11 +1,9 @@
 """`vertiwm compare`: train policies in several models and test them all alike."""
 
-from collections.abc import Sequence
-
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.evaluation.compare import CompareConfig, compare
 
 
-def run(name: str, words: Sequence[str]) -> None:
+def run(name: str, words: list[str]) -> None:
     config = arguments.with_file(CompareConfig, "table3", name, words)
     print(f"\n{compare(config)}")

@@ -1,6 +1,5 @@
 """`vertiwm evaluate`: how well a model predicts, and a policy drives."""
 
-from collections.abc import Sequence
 from typing import Annotated
 
 import tyro
@@ -17,7 +16,7 @@ Test = (
 )
 
 
-def run(name: str, words: Sequence[str]) -> None:
+def run(name: str, words: list[str]) -> None:
     off = (tyro.conf.FlagConversionOff,)
     test = arguments.read(Test, name, words, description=__doc__, config=off)
     print(f"\n{test.run()}")

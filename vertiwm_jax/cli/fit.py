@@ -1,8 +1,5 @@
 """`vertiwm fit`: fit Verti-WM to recorded drives, all stages of it."""
 
-from collections.abc import Sequence
-from pathlib import Path
-
 from vertiwm_jax import figures, runs
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.evaluation import plots
@@ -19,18 +16,13 @@ CURVES = {
 }
 
 
-def run(name: str, words: Sequence[str]) -> None:
+def run(name: str, words: list[str]) -> None:
     config = arguments.with_file(FitConfig, "fit_chrono", name, words)
     folder = experiment.run(config)
-    _draw(folder)
-    print(f"the model is in {folder / 'model'}; how well it predicts:")
-    data = config.data[0]
-    print(f"python -m vertiwm_jax.evaluate prediction --compare {folder} --data {data}")
-
-
-def _draw(folder: Path) -> None:
-    """Losses and errors on validation drives of the stages that learn from rollouts."""
     stages = [found.name for name in ROLLOUTS for found in sorted(folder.glob(name))]
     curves = {name: runs.read_columns(folder / name) for name in stages}
     figure = plots.learning_curves(curves, "updates", CURVES)
     figures.save(figure, folder / "learning_curves.png")
+    print(f"the model is in {folder / 'model'}; how well it predicts:")
+    data = config.data[0]
+    print(f"python -m vertiwm_jax.evaluate prediction --compare {folder} --data {data}")

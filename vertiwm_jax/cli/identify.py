@@ -1,7 +1,5 @@
 """`vertiwm identify`: numbers of a vehicle from its drives."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
@@ -13,27 +11,28 @@ from vertiwm_jax.learning import identification
 from vertiwm_jax.mechanics.vehicle import HMMWV
 
 
-@dataclass(frozen=True)
-class Identify:
-    """Find numbers of a vehicle with which the built-in simulator predicts its drives best."""
-
-    drives: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of drives, as `collect` and `import_drives` write them."""
-    output: Path
-    """YAML file of the vehicle to write, for `--vehicle` of other commands."""
-    vehicle: str = HMMWV
-    """Numbers to begin with: the name of a vehicle that comes along, or a YAML file of one."""
-    free: tuple[str, ...] = identification.FREE
-    """Which of its numbers to find."""
-    horizon: int = 16
-    """Steps of 0.1 s that are predicted."""
+def run(name: str, words: list[str]) -> None:
+    arguments.read(identify, name, words)
 
 
-def run(name: str, words: Sequence[str]) -> None:
-    command = arguments.read(Identify, name, words)
-    found = identification.identify(
-        command.drives, command.vehicle, free=command.free, horizon=command.horizon
-    )
-    atomic.write(command.output, configuration.dump(found))
-    print(f"the vehicle is in {command.output}; to train with it:")
-    print(f"python -m vertiwm_jax.ppo --model builtin --vehicle {command.output}")
+def identify(
+    drives: tyro.conf.Positional[tuple[Path, ...]],
+    output: Path,
+    vehicle: str = HMMWV,
+    free: tuple[str, ...] = identification.FREE,
+    horizon: int = 16,
+) -> None:
+    """Find numbers of a vehicle with which the built-in simulator predicts its drives best.
+
+    Args:
+        drives: Folders of drives, as `collect` and `import_drives` write them.
+        output: YAML file of the vehicle to write, for `--vehicle` of other commands.
+        vehicle: Numbers to begin with: the name of a vehicle that comes along, or a YAML file of
+            one.
+        free: Which of its numbers to find.
+        horizon: Steps of 0.1 s that are predicted.
+    """
+    found = identification.identify(drives, vehicle, free=free, horizon=horizon)
+    atomic.write(output, configuration.dump(found))
+    print(f"the vehicle is in {output}; to train with it:")
+    print(f"python -m vertiwm_jax.ppo --model builtin --vehicle {output}")

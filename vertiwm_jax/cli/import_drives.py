@@ -1,6 +1,5 @@
 """`vertiwm import_drives`: logs of other origin as drives to fit and to test on."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -25,7 +24,7 @@ class ImportDrives:
     """The ground, an .npz map; by default that of a bag's GridMap topic."""
 
 
-def run(name: str, words: Sequence[str]) -> None:
+def run(name: str, words: list[str]) -> None:
     command = arguments.read(ImportDrives, name, words)
     print(import_drives(command.sources, command.output, command.settings, map=command.map))
     print(f"the drives are in {command.output}; to fit the world model to them:")

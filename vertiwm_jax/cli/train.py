@@ -1,13 +1,11 @@
 """`vertiwm ppo`, `sac` and `td3`: train a driving policy and show how well it drives."""
 
-from collections.abc import Sequence
-
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.evaluation import report
 from vertiwm_jax.rl import experiment
 
 
-def run(name: str, words: Sequence[str]) -> None:
+def run(name: str, words: list[str]) -> None:
     config = arguments.with_file(experiment.TRAININGS[name], name, name, words)
     trained = experiment.run(config)
     print(f"\n{report.after_training(trained)}\n")
