@@ -142,6 +142,7 @@ class SoilFilter:
         c = self.context
         states = VehicleState.from_vector(belief.states)
         commands = Command.from_vector(belief.commands)
+        before, after = _at(commands, slice(c)), _at(commands, slice(c, None))
         known, start, end = (_at(states, place) for place in (slice(c + 1), c, -1))
         kinds = query.surface(terrain, states.position[c:, :2]).semantic
         kind = kinds[-1]
@@ -151,20 +152,15 @@ class SoilFilter:
             """`[6]` recorded minus predicted pose at the end of the buffer, over the noise."""
             soils = replace(aged, mean=aged.mean.at[kind].set(mean))
             ground = believed(terrain, replace(belief, soils=soils))
-            history = warm_up(model, params, ground, known, _at(commands, slice(c)))
-            predicted = rollout(
-                model, params, ground, start, _at(commands, slice(c, None)), history
-            )
+            history = warm_up(model, params, ground, known, before)
+            predicted = rollout(model, params, ground, start, after, history)
             return motion.increment(_at(predicted, -1), end) / jnp.asarray(self.noise)
 
         posterior, plausible = kalman.correct(
             _at(aged, kind), residual, self.gate, self.iterations, LONGEST_STEP
         )
-        counts = (
-            (belief.steps >= self.context + self.horizon)
-            & terrain.deformable[kind]
-            & jnp.all(kinds == kind)
-        )
+        full = belief.steps >= self.context + self.horizon
+        counts = full & terrain.deformable[kind] & jnp.all(kinds == kind)
         corrected = jax.tree.map(lambda x, y: x.at[kind].set(y), aged, posterior)
         return replace(
             belief,

@@ -66,13 +66,16 @@ class Planner(Agent):
     dynamics: Params
     config: PlannerConfig = struct.field(pytree_node=False)
 
-    @abstractmethod
     def intended(self, now: Now, memory: Plan) -> jax.Array:
-        """`[K, 2]` the plan about which others are drawn."""
+        """`[K, 2]` the plan about which others are drawn.
 
-    @abstractmethod
+        The last one moved on by a decision; after its end the last decision again.
+        """
+        return jnp.concatenate([memory.corrections[1:], memory.corrections[-1:]])
+
     def decision(self, plan: jax.Array, number: jax.Array, observation: jax.Array) -> jax.Array:
-        """`[2]` what is decided after `number` decisions of a plan `[K, 2]`."""
+        """`[2]` what is decided after `number` decisions of a plan `[K, 2]`; as planned."""
+        return plan[number]
 
     @abstractmethod
     def expected(self, end: Now) -> jax.Array:
@@ -164,14 +167,6 @@ class OpenLoopPlanner(Planner):
     interval = property(attrgetter("config.interval"))
     discount = property(attrgetter("config.discount"))
     planned = property(attrgetter("config.decisions"))
-
-    def intended(self, now: Now, memory: Plan) -> jax.Array:
-        """`[D, 2]` the last plan moved on by a decision; after its end the last one again."""
-        return jnp.concatenate([memory.corrections[1:], memory.corrections[-1:]])
-
-    def decision(self, plan: jax.Array, number: jax.Array, observation: jax.Array) -> jax.Array:
-        """`[2]` as planned."""
-        return plan[number]
 
     def expected(self, end: Now) -> jax.Array:
         """The discounted return `[]` of going on by the route to the goal, at a steady pace."""

@@ -40,10 +40,9 @@ class ShootingConfig(OpenLoopConfig):
     """What it imagines in; NeSAM's gradient takes minutes to compile, the bicycle's seconds."""
 
     def check(self):
-        if self.improved > self.candidates:
-            raise ValueError(
-                f"improved: expected 1 to the {self.candidates} candidates, found {self.improved}"
-            )
+        found, most = self.improved, self.candidates
+        if found > most:
+            raise ValueError(f"improved: expected 1 to the {most} candidates, found {found}")
 
 
 @struct.dataclass
