@@ -1,6 +1,6 @@
 """Errors that commands print in one line."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
@@ -28,6 +28,20 @@ def needs(package: str, extra: str, what: object) -> Iterator[None]:
             f"{what}: expected the package {package}, found: {error}; "
             f'pip install "vertiwm-jax[{extra}]"'
         ) from None
+
+
+@contextmanager
+def refusing(refusal: Callable[[str], UserError]) -> Iterator[None]:
+    """Raises `refusal(found)` where a damaged file causes an error; found: what that says.
+
+    A `UserError` passes as it is.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise refusal(one_line(error)) from None
 
 
 def one_line(error: Exception) -> str:

@@ -7,7 +7,7 @@ import pytest
 from importers.logged import SETTINGS, logged
 from scipy.spatial.transform import Rotation
 
-from vertiwm_jax.importers import log
+from vertiwm_jax.importers.log import Log, converted
 from vertiwm_jax.importers.settings import Frames, ImportSettings, Units, VehicleSettings
 from vertiwm_jax.learning.schema import DataError
 
@@ -33,18 +33,19 @@ def assert_same(found, expected):
 
 
 def test_roll_pitch_yaw_are_rz_ry_rx(arrays):
-    found = log.build("a", SETTINGS, **arrays)
+    found = converted(Log(**arrays), "a", SETTINGS)
     c, s = np.cos(arrays["attitude"].T), np.sin(arrays["attitude"].T)
     for k in range(len(arrays["time"])):
         x = np.array([[1, 0, 0], [0, c[0, k], -s[0, k]], [0, s[0, k], c[0, k]]])
         y = np.array([[c[1, k], 0, s[1, k]], [0, 1, 0], [-s[1, k], 0, c[1, k]]])
         z = np.array([[c[2, k], -s[2, k], 0], [s[2, k], c[2, k], 0], [0, 0, 1]])
         np.testing.assert_allclose(found.rotation[k].as_matrix(), z @ y @ x, atol=1e-12)
-    assert_same(log.build("a", SETTINGS, **arrays | {"attitude": found.rotation.as_quat()}), found)
+    arrays["attitude"] = found.rotation.as_quat()
+    assert_same(converted(Log(**arrays), "a", SETTINGS), found)
 
 
 def test_units_are_converted(arrays):
-    expected = log.build("a", SETTINGS, **arrays)
+    expected = converted(Log(**arrays), "a", SETTINGS)
     units = Units(1e-3, 0.01, np.pi / 180, 1 / 3.6, 5.0, -0.5)
     other = {
         "time": arrays["time"] * 1e3,
@@ -55,13 +56,13 @@ def test_units_are_converted(arrays):
         "command_time": arrays["command_time"] * 1e3,
         "command": arrays["command"] / [5, -0.5],
     }
-    assert_same(log.build("a", replace(SETTINGS, units=units), **other), expected)
+    assert_same(converted(Log(**other), "a", replace(SETTINGS, units=units)), expected)
 
 
 @pytest.mark.parametrize("as_quaternion", [False, True])
 def test_frames_are_converted(arrays, as_quaternion):
     """North-east-down, with velocities in the world, and a world that begins elsewhere."""
-    expected = log.build("a", SETTINGS, **arrays)
+    expected = converted(Log(**arrays), "a", SETTINGS)
     flip, origin = np.diag([1.0, -1, -1]), np.array([500.0, -300, 20])
     down = Rotation.from_matrix(flip @ expected.rotation.as_matrix() @ flip)
     frames = Frames("z_down", "world", "world", tuple(origin.tolist()))
@@ -71,7 +72,7 @@ def test_frames_are_converted(arrays, as_quaternion):
         "velocity": down.apply(arrays["velocity"] @ flip),
         "angular_velocity": down.apply(arrays["angular_velocity"] @ flip),
     }
-    assert_same(log.build("a", replace(SETTINGS, frames=frames), **other), expected)
+    assert_same(converted(Log(**other), "a", replace(SETTINGS, frames=frames)), expected)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +92,7 @@ def test_what_cannot_be_used_is_named(arrays, field, sample, value, message):
     arrays = {name: array.copy() for name, array in arrays.items()} | {"attitude": quaternions}
     arrays[field][sample] = value
     with pytest.raises(DataError, match=message) as error:
-        log.build("a.csv", SETTINGS, **arrays)
+        converted(Log(**arrays), "a.csv", SETTINGS)
     assert "\n" not in str(error.value)
 
 
@@ -99,7 +100,7 @@ def test_stamps_that_repeat_are_refused(arrays):
     arrays["time"] = arrays["time"].copy()
     arrays["time"][8] = arrays["time"][7]
     with pytest.raises(DataError, match="expected stamps that increase"):
-        log.build("a", SETTINGS, **arrays)
+        converted(Log(**arrays), "a", SETTINGS)
 
 
 def test_settings_of_no_vehicle():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from importers.logged import SETTINGS, Logged, commands, errors, logged, rms
 
-from vertiwm_jax.importers import log
+from vertiwm_jax.importers.log import Log, converted
 from vertiwm_jax.importers.resampling import resample
 from vertiwm_jax.importers.settings import Resampling
 
@@ -21,9 +21,7 @@ def build(seen: Logged, rows=slice(None), with_velocities: bool = False, setting
             "velocity": seen.state[rows, 6:9],
             "angular_velocity": seen.state[rows, 9:12],
         }
-    return log.build(
-        "a.csv",
-        settings,
+    found = Log(
         time=seen.time[rows],
         position=seen.position[rows],
         attitude=seen.rotation.as_quat()[rows],
@@ -31,6 +29,7 @@ def build(seen: Logged, rows=slice(None), with_velocities: bool = False, setting
         command=seen.command[rows],
         **velocities,
     )
+    return converted(found, "a.csv", settings)
 
 
 def moments(seen: Logged, steps: int, first: int = 0) -> np.ndarray:
@@ -100,15 +99,14 @@ def test_gaps_end_a_drive():
 def test_drives_need_poses_and_commands():
     seen = logged()
     late = seen.time > 110
-    found = log.build(
-        "a.bag",
-        SETTINGS,
+    found = Log(
         time=seen.time,
         position=seen.position,
         attitude=seen.rotation.as_quat(),
         command_time=seen.time[late],
         command=seen.command[late],
     )
+    found = converted(found, "a.bag", SETTINGS)
     (drive,) = resample(found, WHOLE, ORIGIN)[0]
     start = seen.time[late][0]
     at = start + 0.1 * np.arange(len(drive.control) + 1)

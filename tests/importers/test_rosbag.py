@@ -9,6 +9,7 @@ import pytest
 from importers.bags import Bag
 from importers.logged import SETTINGS, VEHICLE, commands, logged
 
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.importers import rosbag
 from vertiwm_jax.importers.settings import ImportSettings, Topics, Units
 from vertiwm_jax.learning.schema import DataError
@@ -60,6 +61,12 @@ def test_a_twist_turns_by_its_yaw_rate(bag):
     )
     (log,) = rosbag.read(bag, angles)
     np.testing.assert_allclose(log.command, commands(COMMAND_TIME) * [1, -2])
+
+
+def test_a_small_vehicle_steers_as_far_at_full_size(bag):
+    (log,) = rosbag.read(bag, TWIST)
+    (rover,) = rosbag.read(bag, replace(TWIST, vehicle=replace(VEHICLE, scale=9.0)))
+    np.testing.assert_allclose(rover.command, log.command * [3, 1])
 
 
 def test_wheels_stay_as_they_were_where_a_twist_stands():
@@ -124,5 +131,5 @@ def test_bags_that_cannot_be_used_are_named(bag, seen, tmp_path):
 
 def test_bags_need_a_package(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(DataError, match=r"package rosbags .* pip install 'vertiwm-jax\[logs\]'"):
+    with pytest.raises(UserError, match=r'package rosbags.* pip install "vertiwm-jax\[logs\]"'):
         rosbag.read(tmp_path / "a.bag", ACKERMANN)

@@ -11,6 +11,7 @@ from importers.logged import SETTINGS, VEHICLE, logged
 from pyarrow import parquet
 
 from vertiwm_jax import config
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.importers import table
 from vertiwm_jax.importers.settings import ImportSettings, Table
 from vertiwm_jax.learning.schema import DataError
@@ -136,5 +137,5 @@ def test_attitudes_are_told_once():
 
 def test_parquet_needs_a_package(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    with pytest.raises(DataError, match=r"package pyarrow .* pip install 'vertiwm-jax\[logs\]'"):
+    with pytest.raises(UserError, match=r'package pyarrow.* pip install "vertiwm-jax\[logs\]"'):
         table.read(tmp_path / "a.parquet", CSV)

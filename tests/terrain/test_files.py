@@ -8,6 +8,7 @@ from disks import full_disk
 from PIL import Image
 
 from vertiwm_jax.atomic import WriteError
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
@@ -172,7 +173,7 @@ def test_heightmap_in_metres_from_npy_and_geotiff(tmp_path):
 
 def test_geotiff_without_its_extra_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tifffile", None)
-    with pytest.raises(MapError, match=r"h.tif: .*pip install 'vertiwm-jax\[geotiff\]'"):
+    with pytest.raises(UserError, match=r'h.tif: .*pip install "vertiwm-jax\[geotiff\]"'):
         files.from_heightmap(tmp_path / "h.tif", 1.0)
 
 

@@ -64,13 +64,6 @@ def test_worlds_are_where_verti_bench_puts_them(checkout):
     )
 
 
-def test_numbers_choose_and_order(checkout):
-    terrain = vertibench.load(checkout, [91, 2])
-    np.testing.assert_allclose(terrain.elevation.max((1, 2)), [16, 4.8], rtol=1e-6)
-    with pytest.raises(MapError, match=r"world 5: expected one file config5_"):
-        vertibench.load(checkout, [5])
-
-
 def test_what_is_wrong_with_a_checkout_is_named(checkout, tmp_path):
     with pytest.raises(MapError, match=r"folder: expected a checkout that holds envs/data"):
         vertibench.load(tmp_path / "envs")
@@ -87,8 +80,11 @@ def test_what_is_wrong_with_a_checkout_is_named(checkout, tmp_path):
         assert old in text
         path.write_text(text.replace(old, new, 1) if old != "wood" else text.replace(old, new))
         with pytest.raises(MapError, match=r"config2_low\.yaml: " + message):
-            vertibench.load(checkout, [2])
+            vertibench.load(checkout)
     path.write_text(text)
     Image.new("L", (64, 64)).save(checkout / vertibench._FOLDER / "Worlds/2.bmp")
     with pytest.raises(MapError, match=r"2.bmp: elevation: expected 129 x 129 pixels"):
-        vertibench.load(checkout, [2])
+        vertibench.load(checkout)
+    (path.parents[2] / "Worlds/5.bmp").touch()
+    with pytest.raises(MapError, match=r"world 5: expected one file config5_"):
+        vertibench.load(checkout)

@@ -120,9 +120,9 @@ def test_labels_cycle_through_all_pairs():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"difficulties": ("hard",)}, "difficulties: expected one of low, mid, high, extreme"),
-        ({"difficulties": (75.0,)}, "median slope of 0 to 60 deg, found 75"),
-        ({"kinds": ("ice",)}, "kinds: expected one of rigid, deformable, mixed, found 'ice'"),
+        ({"difficulties": ("hard",)}, "difficulties: expected .* one of low, mid, high, extreme"),
+        ({"difficulties": (75.0,)}, "a median slope of 0 to 60 deg, .*, found .75"),
+        ({"kinds": ("ice",)}, "kinds: expected one of rigid, deformable, mixed, found .'ice'"),
         ({"kinds": ()}, "found none"),
     ],
 )

@@ -61,12 +61,7 @@ def terrain(
                 )
             canvas.paint(patch, origin)
     assert canvas is not None  # A topic without messages is refused.
-    return _build(f"{paths[0]}: {wanted.topic}", canvas, wanted, frames)
-
-
-def _build(
-    name: str, canvas: Canvas, wanted: GridMapSettings, frames: Frames
-) -> tuple[TerrainMap, float]:
+    name = f"{paths[0]}: {wanted.topic}"
     known = np.isfinite(canvas.values[0])
     if not known.any():
         raise DataError(f"{name}: {wanted.elevation}: expected heights, found none that is finite")

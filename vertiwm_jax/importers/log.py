@@ -1,9 +1,8 @@
 """A logged drive, checked and converted to SI units, full size and the axes of this project."""
 
-from dataclasses import dataclass
-from importlib import import_module
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,103 +15,86 @@ from vertiwm_jax.learning.schema import DataError
 class Log:
     """N poses of the logged point and M commands, each with its own time stamps.
 
-    time: `[N]` s, increasing; position: `[N, 3]` p_world, m; rotation: N of body to world;
-    velocity: `[N, 3]` v_body, m/s, angular_velocity: `[N, 3]` omega_body, rad/s, None where they
-    were not logged; command_time: `[M]` s, increasing; command: `[M, 2]` m/s and rad.
+    A reader gives them in the units and frames of its file, `converted` in those that follow.
+
+    time: `[N]` s, increasing; position: `[N, 3]` p_world, m; attitude: of body to world, `[N, 3]`
+    roll, pitch, yaw, rad, or `[N, 4]` quaternions x, y, z, w; command_time: `[M]` s, increasing;
+    command: `[M, 2]` speed and front-wheel angle, m/s and rad; velocity: `[N, 3]` v_body, m/s, and
+    angular_velocity: `[N, 3]` omega_body, rad/s, None where they were not logged.
     """
 
     time: np.ndarray
     position: np.ndarray
-    rotation: Rotation
-    velocity: np.ndarray | None
-    angular_velocity: np.ndarray | None
+    attitude: np.ndarray
     command_time: np.ndarray
     command: np.ndarray
+    velocity: np.ndarray | None = None
+    angular_velocity: np.ndarray | None = None
+
+    @cached_property
+    def rotation(self) -> Rotation:
+        """N attitudes."""
+        if self.attitude.shape[1] == 4:
+            return Rotation.from_quat(self.attitude)
+        return Rotation.from_euler("ZYX", self.attitude[:, ::-1])
+
+    def part(self, poses: slice) -> "Log":
+        """The log with some of its poses, and all commands."""
+        names = ("time", "position", "attitude", "velocity", "angular_velocity")
+        logged = {name: getattr(self, name) for name in names}
+        return replace(self, **{k: x if x is None else x[poses] for k, x in logged.items()})
 
 
-def build(
-    name: str | Path,
-    settings: ImportSettings,
-    time: np.ndarray,
-    position: np.ndarray,
-    attitude: np.ndarray,
-    command_time: np.ndarray,
-    command: np.ndarray,
-    velocity: np.ndarray | None = None,
-    angular_velocity: np.ndarray | None = None,
-) -> Log:
-    """Makes a log from arrays in the units and frames of the log file.
+def converted(log: Log, name: str | Path, settings: ImportSettings) -> Log:
+    """The log in SI units, at full size and in the axes of this project.
 
-    time: `[N]`; position: `[N, 3]`; attitude: `[N, 3]` roll, pitch, yaw or `[N, 4]` quaternions
-    x, y, z, w; velocity, angular_velocity: `[N, 3]`; command_time: `[M]`; command: `[M, 2]` speed
-    and steering. Raises `DataError`, which calls the log `name`, unless all are finite, stamps
-    increase, quaternions have length 1 and there are two poses.
+    log: in the units and frames of its file. Raises `DataError`, which calls it `name`, unless all
+    are finite, stamps increase, quaternions have length 1 and there are two poses.
     """
-    arrays = {
-        "time": time,
-        "position": position,
-        "attitude": attitude,
-        "velocity": velocity,
-        "angular_velocity": angular_velocity,
-        "time of commands": command_time,
-        "command": command,
-    }
-    for field, array in arrays.items():
-        if array is not None:
-            _check_finite(f"{name}: {field}", array)
-    if len(time) < 2:
+    for field, array in vars(log).items():
+        if array is None:
+            continue
+        called = f"{name}: {'time of commands' if field == 'command_time' else field}"
+        if not len(array):
+            raise DataError(f"{called}: expected one value or more, found none")
+        wrong = ~np.isfinite(array.reshape(len(array), -1)).all(1)
+        _refuse(f"{called}: expected finite numbers", wrong, array)
+        if array.ndim == 1:
+            wrong = np.diff(array, prepend=-np.inf) <= 0
+            _refuse(f"{called}: expected stamps that increase", wrong, array)
+    if len(log.time) < 2:
         raise DataError(f"{name}: time: expected two poses or more, found one")
-    for field, stamps in (("time", time), ("time of commands", command_time)):
-        wrong = np.diff(stamps, prepend=-np.inf) <= 0
-        _refuse(f"{name}: {field}: expected stamps that increase", wrong, stamps)
     units, frames = settings.units, settings.frames
     meter = settings.vehicle.scale
     second = meter**0.5  # Froude's similarity: gravity is the same at any size.
     # Half a turn about x takes z_down to z_up, in the world and in the body.
     axes = np.array([1, 1, 1] if frames.axes == "z_up" else [1, -1, -1])
-    if attitude.shape[1] == 3:
-        rpy = axes * units.angle * attitude
-        rotation = Rotation.from_euler("ZYX", rpy[:, ::-1])
+    if log.attitude.shape[1] == 3:
+        attitude = axes * units.angle * log.attitude
     else:
-        length = np.linalg.norm(attitude, axis=1)
+        length = np.linalg.norm(log.attitude, axis=1)
         wrong = np.abs(length - 1) > 0.01
         _refuse(f"{name}: attitude: expected quaternions of length 1", wrong, length)
-        rotation = Rotation.from_quat(attitude * [*axes, 1])
-    if velocity is not None:
-        velocity = axes * units.velocity * meter / second * velocity
-        velocity = velocity if frames.velocity == "body" else rotation.inv().apply(velocity)
-    if angular_velocity is not None:
-        omega = axes * units.angle / second * angular_velocity
-        angular_velocity = (
-            omega if frames.angular_velocity == "body" else rotation.inv().apply(omega)
-        )
+        attitude = log.attitude * [*axes, 1]
+    rotation = replace(log, attitude=attitude).rotation
+
+    def in_body(logged: np.ndarray | None, unit: float, frame: str) -> np.ndarray | None:
+        if logged is None:
+            return None
+        turned = axes * unit * logged
+        return turned if frame == "body" else rotation.inv().apply(turned)
+
     return Log(
-        time=second * units.time * time,
-        position=meter * (axes * units.position * position - np.asarray(frames.origin)),
-        rotation=rotation,
-        velocity=velocity,
-        angular_velocity=angular_velocity,
-        command_time=second * units.time * command_time,
-        command=command * [meter / second * units.speed, units.steering],
+        time=second * units.time * log.time,
+        position=meter * (axes * units.position * log.position - np.asarray(frames.origin)),
+        attitude=attitude,
+        command_time=second * units.time * log.command_time,
+        command=log.command * [meter / second * units.speed, units.steering],
+        velocity=in_body(log.velocity, units.velocity * meter / second, frames.velocity),
+        angular_velocity=in_body(
+            log.angular_velocity, units.angle / second, frames.angular_velocity
+        ),
     )
-
-
-def needed(path: Path, module: str) -> Any:
-    """A module that reading `path` needs; `DataError` where its package is not installed."""
-    try:
-        return import_module(module)
-    except ImportError:
-        raise DataError(
-            f"{path}: expected the package {module.split('.')[0]} to read it, it is not installed; "
-            "pip install 'vertiwm-jax[logs]'"
-        ) from None
-
-
-def _check_finite(field: str, array: np.ndarray) -> None:
-    if not len(array):
-        raise DataError(f"{field}: expected one value or more, found none")
-    wrong = ~np.isfinite(array.reshape(len(array), -1)).all(1)
-    _refuse(f"{field}: expected finite numbers", wrong, array)
 
 
 def _refuse(expected: str, wrong: np.ndarray, values: np.ndarray) -> None:

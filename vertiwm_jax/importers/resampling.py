@@ -38,9 +38,10 @@ def resample(
     """
     drives, left_out = list[Drive](), Counter[str]()
     for poses in _runs(log.time, settings.gap):
+        part = log.part(poses)
+        last = part.time[-1]
         for commands in _runs(log.command_time, settings.command_gap):
-            last = log.time[poses][-1]
-            start = max(log.time[poses][0], log.command_time[commands][0])
+            start = max(part.time[0], log.command_time[commands][0])
             end = min(last, log.command_time[commands][-1] + settings.command_gap)
             if end < start:
                 continue
@@ -49,7 +50,7 @@ def resample(
                 left_out[f"shorter than {settings.shortest} steps"] += 1
                 continue
             at = np.minimum(start + STEP_SECONDS * np.arange(steps + 1), last)
-            state = _state(log, poses, at, settings.window, logged_point)
+            state = _state(part, at, settings.window, logged_point)
             latest = np.searchsorted(log.command_time, at[:-1] + _TOLERANCE, side="right") - 1
             drives += _pieces(Drive(state, log.command[latest]), settings.longest)
     return drives, left_out
@@ -81,20 +82,17 @@ def _runs(stamps: np.ndarray, gap: float) -> Iterator[slice]:
         yield slice(first, end)
 
 
-def _state(
-    log: Log, poses: slice, at: np.ndarray, window: float, logged_point: np.ndarray
-) -> np.ndarray:
+def _state(log: Log, at: np.ndarray, window: float, logged_point: np.ndarray) -> np.ndarray:
     """`[T + 1, 12]` states at `[T + 1]` moments, from poses without a gap."""
-    time, position, rotation = log.time[poses], log.position[poses], log.rotation[poses]
-    attitude = Slerp(time, rotation)(at)
+    attitude = Slerp(log.time, log.rotation)(at)
 
     def between(values: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(at, time, column) for column in values[poses].T], 1)
+        return np.stack([np.interp(at, log.time, column) for column in values.T], 1)
 
     velocity = None if log.velocity is None else between(log.velocity)
     omega = None if log.angular_velocity is None else between(log.angular_velocity)
     if velocity is None or omega is None:
-        fitted = _slopes(time, position, rotation, at, attitude, window)
+        fitted = _slopes(log, at, attitude, window)
         velocity = attitude.inv().apply(fitted[:, :3]) if velocity is None else velocity
         omega = fitted[:, 3:] if omega is None else omega
     return np.concatenate(
@@ -108,28 +106,21 @@ def _state(
     )
 
 
-def _slopes(
-    time: np.ndarray,
-    position: np.ndarray,
-    rotation: Rotation,
-    at: np.ndarray,
-    attitude: Rotation,
-    window: float,
-) -> np.ndarray:
-    """`[T + 1, 6]` v_world, m/s, and omega_body, rad/s, of N poses at moments and attitudes there.
+def _slopes(log: Log, at: np.ndarray, attitude: Rotation, window: float) -> np.ndarray:
+    """`[T + 1, 6]` v_world, m/s, and omega_body, rad/s, at moments and attitudes there.
 
     As Savitzky and Golay smooth, but over the stamps as they are: at the ends of a drive the
     window is moved inwards. Rotations are fitted as rotation vectors from the attitude there.
     """
-    slopes = np.empty((len(at), 6))
+    time, slopes = log.time, np.empty((len(at), 6))
     inside = np.clip(at, time[0] + window / 2, max(time[-1], time[0] + window) - window / 2)
     first, middle, end = (np.searchsorted(time, inside + d) for d in (-window / 2, 0, window / 2))
     first = np.minimum(first, np.maximum(middle - _EACH_SIDE, 0))
     end = np.maximum(end, np.minimum(middle + _EACH_SIDE, len(time)))
     for k, moment in enumerate(at):
         near = slice(first[k], end[k])
-        turned = (attitude[k].inv() * rotation[near]).as_rotvec()
-        values = np.concatenate([position[near], turned], axis=1)
+        turned = (attitude[k].inv() * log.rotation[near]).as_rotvec()
+        values = np.concatenate([log.position[near], turned], axis=1)
         slopes[k] = np.polynomial.polynomial.polyfit(time[near] - moment, values, 2)[1]
     return slopes
 

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from vertiwm_jax.errors import one_line
-from vertiwm_jax.importers import log
-from vertiwm_jax.importers.log import Log
+from vertiwm_jax.errors import needs, refusing
+from vertiwm_jax.importers.log import Log, converted
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.learning.schema import DataError
 
@@ -63,9 +62,7 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
     ]
     time, position, attitude, velocity, omega = (np.array(x) for x in zip(*poses, strict=True))
     command_time, speed, turn, is_twist = (np.array(x) for x in zip(*commands, strict=True))
-    found = log.build(
-        path,
-        settings,
+    found = Log(
         time=time,
         position=position,
         attitude=attitude,
@@ -74,9 +71,13 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
         command_time=command_time,
         command=np.stack([speed, turn], axis=1),
     )
+    found = converted(found, path, settings)
     if is_twist[0] and names.twist == "yaw_rate":
-        angle = steering(found.command[:, 0], found.command[:, 1], settings.vehicle.wheelbase)
-        found = replace(found, command=np.stack([found.command[:, 0], angle], axis=1))
+        speed, yaw_rate = found.command.T
+        vehicle = settings.vehicle
+        # At full size the wheelbase is `scale` times as long; the yaw rate is still the vehicle's.
+        angle = steering(speed, yaw_rate, vehicle.wheelbase * vehicle.scale**0.5)
+        found = replace(found, command=np.stack([speed, angle], axis=1))
     return [found]
 
 
@@ -96,31 +97,30 @@ def messages(path: Path, topic: str, kinds: Sequence[str]) -> Iterator[tuple[int
 
     Raises `DataError` where the bag cannot be read, or has no such messages.
     """
-    highlevel = log.needed(path, "rosbags.highlevel")
-    typesys = log.needed(path, "rosbags.typesys")
+    with needs("rosbags", "logs", path):
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     if path.suffix in (".db3", ".mcap"):  # Of a folder that says what is in it.
         path = path.parent
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS2_HUMBLE)
     for kind, text in DEFINITIONS.items():
-        store.register(typesys.get_types_from_msg(text, kind))
-    try:
-        with highlevel.AnyReader([path], default_typestore=store) as reader:
-            found = [c for c in reader.connections if c.topic == topic]
-            others = sorted({c.msgtype for c in found} - set(kinds))
-            expected = f"{path}: {topic}: expected messages of {' or '.join(kinds)}"
-            if others:
-                raise DataError(f"{expected}, found {', '.join(others)}")
-            read = 0
-            for connection, received, data in reader.messages(found) if found else ():
-                yield received, reader.deserialize(data, connection.msgtype)
-                read += 1
-            if not read:
-                every = ", ".join(sorted({c.topic for c in reader.connections}))
-                raise DataError(f"{expected}, found none; there is {every or 'nothing'}")
-    except DataError:
-        raise
-    except Exception as error:  # Of databases, YAML and messages, each in its own way.
-        raise DataError(f"{path}: expected a ROS bag: {one_line(error)}") from None
+        store.register(get_types_from_msg(text, kind))
+    with (
+        refusing(lambda found: DataError(f"{path}: expected a ROS bag: {found}")),
+        AnyReader([path], default_typestore=store) as reader,
+    ):
+        found = [c for c in reader.connections if c.topic == topic]
+        others = sorted({c.msgtype for c in found} - set(kinds))
+        expected = f"{path}: {topic}: expected messages of {' or '.join(kinds)}"
+        if others:
+            raise DataError(f"{expected}, found {', '.join(others)}")
+        read = 0
+        for connection, received, data in reader.messages(found) if found else ():
+            yield received, reader.deserialize(data, connection.msgtype)
+            read += 1
+        if not read:
+            every = ", ".join(sorted({c.topic for c in reader.connections}))
+            raise DataError(f"{expected}, found none; there is {every or 'nothing'}")
 
 
 def _stamp(received: int, message: Any, by_header: bool) -> float:

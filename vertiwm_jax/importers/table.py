@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vertiwm_jax.errors import one_line
-from vertiwm_jax.importers import log
-from vertiwm_jax.importers.log import Log
+from vertiwm_jax.errors import needs, refusing
+from vertiwm_jax.importers.log import Log, converted
 from vertiwm_jax.importers.settings import ImportSettings, Table
 from vertiwm_jax.learning.schema import DataError
 
@@ -38,24 +37,24 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
 
 def _csv_columns(path: Path, names: Sequence[str]) -> Columns:
     """Columns of a CSV file with a header line, as text."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.reader(file, skipinitialspace=True)
-            head = next(rows, [])
-            _check_head(path, names, head)
-            places = [head.index(name) for name in names]
-            cells = []
-            for row in rows:
-                if not any(cell.strip() for cell in row):
-                    continue
-                if len(row) != len(head):
-                    raise DataError(
-                        f"{path}: line {rows.line_num}: expected {len(head)} values as in the "
-                        f"head, found {len(row)}"
-                    )
-                cells.append([row[place] for place in places])
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path}: expected a CSV file in UTF-8: {error}") from None
+    cells = []
+    with (
+        refusing(lambda found: DataError(f"{path}: expected a CSV file in UTF-8: {found}")),
+        path.open(newline="", encoding="utf-8-sig") as file,
+    ):
+        rows = csv.reader(file, skipinitialspace=True)
+        head = next(rows, [])
+        _check_head(path, names, head)
+        places = [head.index(name) for name in names]
+        for row in rows:
+            if not any(cell.strip() for cell in row):
+                continue
+            if len(row) != len(head):
+                raise DataError(
+                    f"{path}: line {rows.line_num}: expected {len(head)} values as in the head, "
+                    f"found {len(row)}"
+                )
+            cells.append([row[place] for place in places])
     if not cells:
         raise DataError(f"{path}: expected rows below the head, found none")
     return dict(zip(names, np.array(cells).T, strict=True))
@@ -63,24 +62,19 @@ def _csv_columns(path: Path, names: Sequence[str]) -> Columns:
 
 def _parquet_columns(path: Path, names: Sequence[str]) -> Columns:
     """Columns of a Parquet file; needs pyarrow."""
-    parquet = log.needed(path, "pyarrow.parquet")
-    try:
-        file = parquet.ParquetFile(path)
+    with needs("pyarrow", "logs", path):
+        from pyarrow.parquet import ParquetFile
+    with refusing(lambda found: DataError(f"{path}: expected a Parquet file: {found}")):
+        file = ParquetFile(path)
         _check_head(path, names, file.schema_arrow.names)
         table = file.read(columns=list(names))
         return {name: table[name].to_numpy() for name in names}
-    except DataError:
-        raise
-    except Exception as error:  # Of pyarrow, of which some are not its own.
-        raise DataError(f"{path}: expected a Parquet file: {one_line(error)}") from None
 
 
 def _names(table: Table) -> list[str]:
     """The names of all columns that are read."""
-    groups = (table.position, table.rpy, table.quaternion, table.velocity, table.angular_velocity)
-    single = (table.time, table.speed, table.steering, table.brake, table.drive)
-    names = [name for group in groups for name in group or ()] + [name for name in single if name]
-    return list(dict.fromkeys(names))
+    groups = [(x,) if isinstance(x, str) else x for x in vars(table).values() if x]
+    return list(dict.fromkeys(name for group in groups for name in group))
 
 
 def _log(name: str, columns: Columns, table: Table, settings: ImportSettings) -> Log:
@@ -92,9 +86,7 @@ def _log(name: str, columns: Columns, table: Table, settings: ImportSettings) ->
     speed = numbers[table.speed]
     if table.brake is not None:
         speed = speed - numbers[table.brake]
-    return log.build(
-        name,
-        settings,
+    found = Log(
         time=numbers[table.time],
         position=stacked(table.position),
         attitude=stacked(table.quaternion or table.rpy or ()),
@@ -103,6 +95,7 @@ def _log(name: str, columns: Columns, table: Table, settings: ImportSettings) ->
         command_time=numbers[table.time],
         command=np.stack([speed, numbers[table.steering]], axis=1),
     )
+    return converted(found, name, settings)
 
 
 def _numbers(name: str, key: str, column: np.ndarray) -> np.ndarray:

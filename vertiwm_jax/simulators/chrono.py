@@ -116,13 +116,8 @@ class _Drive:
         system.SetCollisionSystemType(chrono.ChCollisionSystem.Type_BULLET)
         system.SetNumThreads(1, 1, 1)
         self._system = system
-        self._rigid: Any = None
-        self._scm: Any = None
-        self._soil_map: Any = None
-        if not ground.soft.all():
-            self._rigid = ground.add_rigid(chrono, vehicle, system)
-        if ground.soft.any():
-            self._scm, self._soil_map = ground.add_soil(vehicle, system)
+        self._rigid = ground.add_rigid(chrono, vehicle, system)
+        self._scm, self._soil_map = ground.add_soil(vehicle, system)
         ground.add_boxes(chrono, system)
         self._add_vehicle(place, yaw)
         self._probes: list[Any] = []

@@ -3,7 +3,6 @@
 Chrono's origin is the middle of the map.
 """
 
-import math
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,8 @@ import numpy as np
 from PIL import Image
 
 from vertiwm_jax.terrain import query
-from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.files import soil_of_chrono
+from vertiwm_jax.terrain.map import BY_WORLD, TerrainMap
 
 RESTITUTION = 0.01
 CELL = 0.1
@@ -44,8 +44,7 @@ class Ground:
     def __init__(self, terrain: TerrainMap) -> None:
         self._terrain, world = terrain, int(terrain.world)
         self._heights, semantic, self._friction, self.boxes = (
-            np.asarray(x[world])
-            for x in (terrain.elevation, terrain.semantic, terrain.friction, terrain.obstacles)
+            np.asarray(getattr(terrain, name)[world]) for name in BY_WORLD
         )
         squares = np.array(self._heights.shape) - 1
         self.size = squares[::-1] * float(terrain.resolution)
@@ -76,7 +75,9 @@ class Ground:
         return self.soft[i, j]
 
     def add_rigid(self, chrono: Any, vehicle: Any, system: Any) -> Any:
-        """Rigid ground, one height map for each rectangle of cells of one friction."""
+        """Rigid ground, one height map for each rectangle of cells of one friction, if any."""
+        if self.soft.all():
+            return None
         rigid = vehicle.RigidTerrain(system)
         down, across = self._across
         spacing = self.size[0] / (self._heights.shape[1] - 1)
@@ -102,7 +103,9 @@ class Ground:
         return rigid
 
     def add_soil(self, vehicle: Any, system: Any) -> tuple[Any, Any]:
-        """SCM over the whole map, and its callback, of which Chrono keeps no reference."""
+        """SCM over the whole map, and its callback, of which Chrono keeps no reference, if any."""
+        if not self.soft.any():
+            return None, None
         scm, callback = vehicle.SCMTerrain(system, False), None
         classes = np.unique(self._semantic)
         if len(classes) == 1:
@@ -144,17 +147,8 @@ class Ground:
         name = self._terrain.class_names[kind]
         if not self._terrain.deformable[kind]:
             return NO_SOIL
-        soil = {name: float(x[kind]) for name, x in vars(query.soils(self._terrain)).items()}
-        return (
-            soil["kphi"],
-            soil["kc"],
-            soil["n"],
-            soil["cohesion"],
-            math.degrees(soil["friction_angle"]),
-            soil["shear_modulus"],
-            ELASTICITY.get(name, STIFFENING * soil["kphi"]),
-            DAMPING,
-        )
+        *soil, _ = soil_of_chrono(query.soils(self._terrain), kind)
+        return (*soil, ELASTICITY.get(name, STIFFENING * soil[0]), DAMPING)
 
     def _soil_map(self, vehicle: Any) -> Any:
         """SCM's callback that gives the soil at a point; no force where the ground is rigid."""

@@ -4,6 +4,7 @@ import io
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -11,9 +12,10 @@ import numpy as np
 from PIL import Image
 
 from vertiwm_jax import atomic, froude
+from vertiwm_jax.errors import needs, refusing
 from vertiwm_jax.terrain import query, soil, vertibench
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
-from vertiwm_jax.terrain.map import MapError, TerrainMap, refusing, stack
+from vertiwm_jax.terrain.map import MapError, TerrainMap, stack
 from vertiwm_jax.terrain.soil import Soil
 
 # How Chrono calls our soil parameters, and how many of its units make one of ours.
@@ -70,7 +72,7 @@ def save(terrain: TerrainMap, path: str | Path) -> None:
     semantic, obstacles = np.asarray(terrain.semantic[world]), np.asarray(terrain.obstacles[world])
     of_class = query.soils(terrain)
     soils = {
-        name: [float(getattr(of_class, f)[k]) * unit for f, unit in _SOIL_FIELDS.values()]
+        name: soil_of_chrono(of_class, k)
         for k, name in enumerate(terrain.class_names)
         if deformable[k]
     }
@@ -88,6 +90,11 @@ def save(terrain: TerrainMap, path: str | Path) -> None:
         meta=np.array(json.dumps(meta)),
     )
     atomic.write(path, stream.getvalue())
+
+
+def soil_of_chrono(soils: Soil, kind: int) -> list[float]:
+    """The soil of a class as Chrono's SCM takes it, and its unit weight; soils: leaves `[K]`."""
+    return [float(getattr(soils, field)[kind]) * unit for field, unit in _SOIL_FIELDS.values()]
 
 
 def from_heightmap(
@@ -133,7 +140,8 @@ def from_heightmap(
 
 def _load_world(path: Path) -> TerrainMap:
     name = str(path)
-    with refusing(name, "file", "an .npz map"), np.load(path, allow_pickle=False) as file:
+    refused = refusing(partial(MapError, name, "file", "an .npz map"))
+    with refused, np.load(path, allow_pickle=False) as file:
         return TerrainMap.from_array(
             file["elevation"],
             file["patch_class"],
@@ -179,7 +187,7 @@ def _soil(key: str, values: dict[str, float], name: str) -> Soil:
 
 def _read_raster(path: Path, field: str) -> np.ndarray:
     """The pixels of an image, GeoTIFF or `.npy` file."""
-    with refusing(str(path), field, "a PNG, .npy or GeoTIFF file"):
+    with refusing(partial(MapError, str(path), field, "a PNG, .npy or GeoTIFF file")):
         suffix = path.suffix.lower()
         if suffix == ".npy":
             return np.load(path, allow_pickle=False)
@@ -190,13 +198,8 @@ def _read_raster(path: Path, field: str) -> np.ndarray:
 
 
 def _read_geotiff(path: Path, field: str) -> np.ndarray:
-    try:
+    with needs("tifffile", "geotiff", f"{path}: {field}"):
         import tifffile
-    except ImportError:
-        raise MapError(
-            str(path), field, "the package tifffile to read GeoTIFF", "it is not installed",
-            "pip install 'vertiwm-jax[geotiff]'",
-        ) from None  # fmt: skip
     with tifffile.TiffFile(path) as tiff:
         page = tiff.pages.first
         pixels = page.asarray()

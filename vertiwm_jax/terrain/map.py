@@ -1,7 +1,6 @@
 """The terrain map of one world, or of many stacked worlds."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
@@ -12,7 +11,7 @@ import numpy as np
 from flax import struct
 from numpy.typing import ArrayLike
 
-from vertiwm_jax.errors import UserError, one_line
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.terrain import soil
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.soil import Soil
@@ -29,15 +28,8 @@ class MapError(UserError, ValueError):
         super().__init__(f"{name}: {field}: expected {expected}, found {found}{ending}")
 
 
-@contextmanager
-def refusing(name: str, field: str, expected: str) -> Iterator[None]:
-    """Turns every error that a damaged file causes into a `MapError`."""
-    try:
-        yield
-    except MapError:
-        raise
-    except Exception as error:
-        raise MapError(name, field, expected, one_line(error)) from None
+BY_WORLD = ("elevation", "semantic", "friction", "obstacles")
+"""The arrays of a map of which each world has its own."""
 
 
 @struct.dataclass
@@ -220,8 +212,7 @@ class TerrainMap:
 
     def subset(self, worlds: np.ndarray) -> Self:
         """The map of some worlds alone, chosen by number or by bool; the first is selected."""
-        names = ("elevation", "semantic", "friction", "obstacles")
-        changes = {name: getattr(self, name)[worlds] for name in names}
+        changes = {name: getattr(self, name)[worlds] for name in BY_WORLD}
         if len(self.soils.n) > 1:
             changes["soils"] = jax.tree.map(lambda leaf: leaf[worlds], self.soils)
         return replace(self, **changes, world=jnp.int32(0))
@@ -249,22 +240,17 @@ def stack(maps: Sequence[TerrainMap], names: Sequence[str] | None = None) -> Ter
                 raise MapError(name, field, f"{ours} as in {names[0]}", f"{other[field]}")
     longest = max(m.obstacles.shape[1] for m in maps)
 
-    def padded(terrain: TerrainMap) -> jax.Array:
-        missing = longest - terrain.obstacles.shape[1]
-        return jnp.pad(terrain.obstacles, ((0, 0), (0, missing), (0, 0)))
+    def of_all(name: str) -> jax.Array:
+        arrays = [getattr(m, name) for m in maps]
+        if name == "obstacles":
+            arrays = [jnp.pad(x, ((0, 0), (0, longest - x.shape[1]), (0, 0))) for x in arrays]
+        return jnp.concatenate(arrays)
 
     soils = jax.tree.map(lambda *x: jnp.concatenate(x), *map(_soils_by_world, maps))
     if all(np.allclose(x, x[:1]) for x in jax.tree.leaves(soils)):
         soils = jax.tree.map(lambda x: x[:1], soils)
-    return replace(
-        maps[0],
-        elevation=jnp.concatenate([m.elevation for m in maps]),
-        semantic=jnp.concatenate([m.semantic for m in maps]),
-        friction=jnp.concatenate([m.friction for m in maps]),
-        obstacles=jnp.concatenate([padded(m) for m in maps]),
-        soils=soils,
-        world=jnp.int32(0),
-    )
+    stacked = {name: of_all(name) for name in BY_WORLD}
+    return replace(maps[0], **stacked, soils=soils, world=jnp.int32(0))
 
 
 def _shared(terrain: TerrainMap) -> dict[str, Any]:

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from vertiwm_jax.terrain.map import TerrainMap
 
-_PIXELS_A_VERTEX = 4
 OBSTACLE = 0.15
 """Shade of gray of rocks and trees."""
 
@@ -33,7 +32,7 @@ def pale(rgb: np.ndarray) -> np.ndarray:
     return 0.45 + 0.55 * rgb / 255
 
 
-def shaded(terrain: TerrainMap, world: int, enlarge: int = _PIXELS_A_VERTEX) -> np.ndarray:
+def shaded(terrain: TerrainMap, world: int, enlarge: int = 4) -> np.ndarray:
     """`[H, W, 3]` in [0, 1], north up: pale class colors, with light from the north-west.
 
     H, W are `enlarge` pixels for each cell between vertices; heights are interpolated.

@@ -32,7 +32,7 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
     to top right, as Chrono builds them. Differentiable: the gradient of `height` with respect
     to `xy` is `gradient`.
     """
-    column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
+    column, row = _on_map(terrain, xy)
     cell = _raster.cell_index(terrain, row, column)
     semantic = _raster.classes(terrain, row, column, cell)
     soft = _raster.gather(terrain.deformable, semantic)
@@ -48,7 +48,9 @@ def surface(terrain: TerrainMap, xy: jax.Array) -> Surface:
     slope_x = along + twist * jnp.where(soft, fy, jnp.where(rising, 0.0, 1.0))
     slope_y = up + twist * jnp.where(soft, fx, jnp.where(rising, 1.0, 0.0))
     gradient = jnp.stack([slope_x, slope_y], axis=-1) / terrain.resolution
-    gradient = jnp.where(_inside(terrain, xy), gradient, 0.0)
+    from_corner = (xy - terrain.origin) * jnp.array([1.0, -1.0])
+    inside = (from_corner >= 0) & (from_corner <= terrain.size)
+    gradient = jnp.where(inside, gradient, 0.0)
     friction = _raster.gather(terrain.friction, cell)
     if terrain.grip is not None:
         friction = terrain.grip * friction
@@ -69,7 +71,7 @@ def soils(terrain: TerrainMap) -> Soil:
 
 def height(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     """`[..., 2]` p_world to `[...]` bilinear height, m, whatever the class."""
-    column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
+    column, row = _on_map(terrain, xy)
     return _raster.bilinear(terrain, row, column)
 
 
@@ -77,20 +79,12 @@ def known(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
     """Whether the map is known at points `[..., 2]` p_world, m: `[...]` bool."""
     if terrain.observed is None:
         return jnp.ones(xy.shape[:-1], bool)
-    column, row = _grid_coordinates(terrain, xy[..., 0], xy[..., 1])
+    column, row = _on_map(terrain, xy)
     return _raster.known(terrain, terrain.observed.known, row, column)
 
 
-def _grid_coordinates(
-    terrain: TerrainMap, x: jax.Array, y: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _on_map(terrain: TerrainMap, xy: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Points to fractional (column, row) of the vertices, on the map."""
-    column = (x - terrain.origin[0]) / terrain.resolution
-    row = (terrain.origin[1] - y) / terrain.resolution
+    column = (xy[..., 0] - terrain.origin[0]) / terrain.resolution
+    row = (terrain.origin[1] - xy[..., 1]) / terrain.resolution
     return _raster.on_map(terrain, column, row)
-
-
-def _inside(terrain: TerrainMap, xy: jax.Array) -> jax.Array:
-    """`[..., 2]` whether each coordinate is within the map's extent."""
-    from_corner = (xy - terrain.origin) * jnp.array([1.0, -1.0])
-    return (from_corner >= 0) & (from_corner <= terrain.size)

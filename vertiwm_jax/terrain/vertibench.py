@@ -4,8 +4,7 @@ A world has a gray height map with one vertex a meter, patches of 8 m with a cla
 and rocks and trees. Soils are where the labels say, which differs from that simulator.
 """
 
-import re
-from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,16 @@ import numpy as np
 import yaml
 from PIL import Image
 
+from vertiwm_jax.errors import refusing
 from vertiwm_jax.terrain.classes import STANDARD
-from vertiwm_jax.terrain.map import MapError, TerrainMap, refusing, stack
+from vertiwm_jax.terrain.map import MapError, TerrainMap, stack
 from vertiwm_jax.terrain.worlds import CELLS, HALF_EXTENT, ROCK_SIZE, TREE_SIZE, VERTICES
 
 _FOLDER = Path("envs/data/BenchMaps/sampled_maps")
 
 
-def load(folder: str | Path, numbers: Iterable[int] | None = None) -> TerrainMap:
-    """Stacks the worlds `numbers` of a checkout, in that order; by default all of them.
+def load(folder: str | Path) -> TerrainMap:
+    """Stacks the worlds of a checkout, in the order of their numbers.
 
     Raises `MapError` naming the file and the field.
     """
@@ -29,15 +29,14 @@ def load(folder: str | Path, numbers: Iterable[int] | None = None) -> TerrainMap
     if not (maps / "Worlds").is_dir():
         expected = f"a checkout that holds {_FOLDER / 'Worlds'}"
         raise MapError(str(folder), "folder", expected, "no such folder")
-    if numbers is None:
-        found = (re.fullmatch(r"(\d+)\.bmp", f.name) for f in (maps / "Worlds").iterdir())
-        numbers = sorted(int(match[1]) for match in found if match)
-    configs = {number: _config_path(maps, number) for number in numbers}
-    worlds = [_world(maps / "Worlds" / f"{number}.bmp", path) for number, path in configs.items()]
-    return stack(worlds, [str(path) for path in configs.values()])
+    images = [image for image in (maps / "Worlds").glob("*.bmp") if image.stem.isdigit()]
+    images.sort(key=lambda image: int(image.stem))
+    paths = [_config_path(maps, image.stem) for image in images]
+    worlds = [_world(image, path) for image, path in zip(images, paths, strict=True)]
+    return stack(worlds, [str(path) for path in paths])
 
 
-def _config_path(maps: Path, number: int) -> Path:
+def _config_path(maps: Path, number: str) -> Path:
     found = sorted((maps / "Configs/Final").glob(f"config{number}_*.yaml"))
     if len(found) != 1:
         raise MapError(
@@ -51,7 +50,7 @@ def _world(image: Path, path: Path) -> TerrainMap:
     name = str(path)
     # The C loader is ten times as fast, where PyYAML was built with it.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    with refusing(name, "file", "Verti-Bench's YAML"):
+    with refusing(partial(MapError, name, "file", "Verti-Bench's YAML")):
         config = yaml.load(path.read_text(), Loader=loader)
         classes, friction = _patches(config["textures"])
         return TerrainMap.from_array(
@@ -67,7 +66,8 @@ def _world(image: Path, path: Path) -> TerrainMap:
 
 
 def _gray(path: Path) -> np.ndarray:
-    with refusing(str(path), "elevation", "an 8-bit gray BMP"), Image.open(path) as image:
+    expected = "an 8-bit gray BMP"
+    with refusing(partial(MapError, str(path), "elevation", expected)), Image.open(path) as image:
         gray = np.asarray(image.convert("L"), np.float32)
     if gray.shape != (VERTICES, VERTICES):
         raise MapError(str(path), "elevation", f"{VERTICES} x {VERTICES} pixels", f"{gray.shape}")

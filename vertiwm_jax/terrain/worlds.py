@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax import froude, xla
-from vertiwm_jax.config import AtLeastOne, CountOrZero, Share, settings
+from vertiwm_jax.config import AtLeastOne, Bounds, CountOrZero, Share, settings
 from vertiwm_jax.terrain.classes import FIRST_DEFORMABLE, STANDARD
-from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.map import BY_WORLD, TerrainMap
 
 VERTICES = 129
 RESOLUTION = 1.0
@@ -46,6 +46,15 @@ _FFT_PERIOD = 256  # the smallest power of two that holds the map without wrappi
 _VORONOI_CELLS = 10
 
 
+def _has_slope(difficulty: Difficulty | float) -> bool:
+    named = difficulty in MEDIAN_SLOPE_DEG
+    return named or (not isinstance(difficulty, str) and 0 <= difficulty < 60)
+
+
+_Slope = Bounds("a median slope of 0 to 60 deg, or one", _has_slope)
+_Difficulties = Annotated[tuple[Difficulty | float, ...], AtLeastOne, _Slope]
+
+
 @settings
 class WorldConfig:
     """Settings of procedural worlds, which cycle through all pairs of difficulty and kind.
@@ -56,8 +65,8 @@ class WorldConfig:
     obstructed: probability that a world has obstacles.
     """
 
-    difficulties: Annotated[tuple[Difficulty | float, ...], AtLeastOne] = ("low", "mid", "high")
-    kinds: Annotated[tuple[Kind, ...], AtLeastOne] = ("rigid", "deformable", "mixed")
+    difficulties: _Difficulties = ("low", "mid", "high")
+    kinds: Annotated[tuple[Kind, ...], AtLeastOne, Bounds("one", _KINDS.__contains__)] = _KINDS
     rocks: CountOrZero = 0
     trees: CountOrZero = 0
     obstructed: Share = 1.0
@@ -65,17 +74,6 @@ class WorldConfig:
     GONE: ClassVar[dict[str, str]] = {
         "relief": "the shape of procedural ground is no longer set; leave this key out"
     }
-
-    def check(self) -> None:
-        for difficulty in self.difficulties:
-            preset = difficulty in MEDIAN_SLOPE_DEG
-            if not preset and (isinstance(difficulty, str) or not 0 <= difficulty < 60):
-                names = ", ".join(MEDIAN_SLOPE_DEG)
-                expected = f"one of {names} or a median slope of 0 to 60 deg"
-                raise ValueError(f"difficulties: expected {expected}, found {difficulty!r}")
-        for kind in self.kinds:
-            if kind not in _KINDS:
-                raise ValueError(f"kinds: expected one of {', '.join(_KINDS)}, found {kind!r}")
 
 
 def labels(config: WorldConfig, count: int) -> list[tuple[Difficulty | float, Kind]]:
@@ -90,9 +88,9 @@ def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> Terrai
     scale: of a small vehicle that is brought to full size, where soils are scaled: the
         worlds are as large as ever there, and so small to the vehicle itself.
     """
-    drawn = labels(config, len(keys))
-    slope = [MEDIAN_SLOPE_DEG[d] if isinstance(d, str) else d for d, _ in drawn]
-    kind = [_KINDS.index(k) for _, k in drawn]
+    wanted = labels(config, len(keys))
+    slope = [MEDIAN_SLOPE_DEG[d] if isinstance(d, str) else d for d, _ in wanted]
+    kind = [_KINDS.index(k) for _, k in wanted]
     # One after the other: `vmap` would be no faster, compile twice as long, and take W times the
     # memory for the transforms; and so every number of worlds runs the same program.
     parts = [
@@ -105,16 +103,9 @@ def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> Terrai
     soils = froude.scaled(STANDARD.stacked_soils(), scale)
     # By NumPy: to stack so many arrays would be a program for every number of worlds.
     stacked = map(np.stack, zip(*jax.device_get(parts), strict=True))
-    elevation, semantic, friction, obstacles = map(jnp.asarray, stacked)
+    drawn = dict(zip(BY_WORLD, map(jnp.asarray, stacked), strict=True))
     level = TerrainMap.from_array(np.zeros((VERTICES, VERTICES)), np.zeros((CELLS, CELLS), int))
-    return replace(
-        level,
-        elevation=elevation,
-        semantic=semantic,
-        friction=friction,
-        obstacles=obstacles,
-        soils=jax.tree.map(lambda leaf: leaf[None], soils),
-    )
+    return replace(level, **drawn, soils=jax.tree.map(lambda leaf: leaf[None], soils))
 
 
 def make_worlds(
