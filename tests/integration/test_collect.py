@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +20,7 @@ from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.registry import load_encoders
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.simulators import chrono, collection, excitation
-from vertiwm_jax.simulators.driving import Drive
-from vertiwm_jax.simulators.protocol import Observation, SimulatorError
+from vertiwm_jax.simulators.protocol import Drive, Observation, SimulatorError, drive
 from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.sensing import SensingConfig
@@ -80,16 +80,16 @@ def test_drives_are_read_as_recorded(collected, maps):
 
 
 def test_going_on_is_as_if_never_stopped(collected, maps, tmp_path, monkeypatch, capsys):
-    write, left = collection.write, []
+    write, left = schema.write, []
 
-    def stopping(path, drives, steps, meta, vehicle):
+    def stopping(path, arrays, meta, wheels):
         if meta["world"] == 1:
             left.extend(path.name for path in (tmp_path / "drives").iterdir())
             raise KeyboardInterrupt
-        write(path, drives, steps, meta, vehicle)
+        write(path, arrays, meta, wheels)
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as stop:
-        patch.setattr(collection, "write", stopping)
+        patch.setattr(schema, "write", stopping)
         run(maps, tmp_path / "drives")
     assert stop.value.code == 130
     assert sorted(left) == ["config.yaml", "maps", "world_000.npz"]
@@ -149,16 +149,16 @@ def test_chrono_that_is_missing_is_named(tmp_path, monkeypatch):
 def test_drives_that_end_early_are_tried_again(maps, monkeypatch):
     lengths, tried = iter([1, 3, 2, 0, 1, 2, 0, 0, 0, 0, 0, 0]), []
 
-    def short(simulator, terrain, start, pilot, steps):
+    def short(simulator, start, pilot, steps, over):
         tried.append(start)
         return Drive([], np.zeros((next(lengths), 2)), "rolled over")
 
-    monkeypatch.setattr(collection, "record", short)
+    monkeypatch.setattr(collection, "drive", short)
     command = collection.CollectConfig(output=maps, seconds=1.0)
-    task = collection.Task(command, load_vehicle(), None, files.load_map(maps), world=0, drive=0)
-    assert len(collection.record_task(task).control) == 3 and len(set(tried)) == 6
+    first = command, load_vehicle(), None, (files.load_map(maps), 0, 0)
+    assert len(collection.record(*first).control) == 3 and len(set(tried)) == 6
     with pytest.raises(SimulatorError, match="world 0: drive 0: expected a step or more"):
-        collection.record_task(task)
+        collection.record(*first)
 
 
 class Scripted:
@@ -190,11 +190,13 @@ def test_endings(maps, tmp_path, index, value, ending, length):
     states[3:, index] = value
     level = files.load_map(maps / "map_0.npz")
     pilot = excitation.sinusoids(np.random.default_rng(0), 5, 0.3725)
-    drive = collection.record(Scripted(states), level, (0, 0, 0), pilot, 5)
-    assert (drive.ending, len(drive.control), len(drive.observations)) == (
+    over = partial(collection.ending, *excitation.within(level, 3.0))
+    found = drive(Scripted(states), (0, 0, 0), pilot, 5, over)
+    assert (found.ending, len(found.control), len(found.observations)) == (
         ending, length, length + 1,
     )  # fmt: skip
-    collection.write(tmp_path / "a.npz", [drive], 5, {"map": "a"}, load_vehicle())
+    arrays, wheels = collection.arrays([found], 5), load_vehicle().wheel_position
+    schema.write(tmp_path / "a.npz", arrays, {"map": "a"}, wheels)
     file = np.load(tmp_path / "a.npz")
     assert file["length"] == [length] and file["state"].shape == (1, 6, 12)
     assert json.loads(str(file["meta"]))["dt"] == 0.1
@@ -246,9 +248,8 @@ def test_a_policy_drives_from_goal_to_goal(maps, encoders):
     size = OBSERVATION_SIZE + (math.prod(EMBEDDING_SHAPE) if encoders else 0)
     policy = jax.tree_util.Partial(AtGoal(size))
     rng = np.random.default_rng(0)
-    pilot = collection.to_goals(
-        policy, config, encoders, load_vehicle(), terrain, (0.0, 0.0, 0.0), rng
-    )
+    learned = policy, config, encoders
+    pilot = collection.to_goals(learned, load_vehicle(), terrain, (0.0, 0.0, 0.0), rng)
     height = float(query.height(terrain, jnp.zeros(2)))
     state, goals = np.array([0, 0, height, *np.zeros(9)], np.float32), []
     for _ in range(3):
@@ -263,9 +264,8 @@ def test_a_policy_drives_from_goal_to_goal(maps, encoders):
     assert np.linalg.norm(np.diff(goals, axis=0), axis=-1).min() >= 20
     command = collection.CollectConfig(output=maps, seconds=2.0)
     alone = jax.device_get(terrain.subset(np.array([0])))
-    task = collection.Task(command, load_vehicle(), (policy, config, encoders), alone, 0, drive=1)
-    drive = collection.record_task(task)
-    assert drive.control.shape == (20, 2) and np.all(drive.control[:, 0] == 2.5)
+    found = collection.record(command, load_vehicle(), learned, (alone, 0, 1))
+    assert found.control.shape == (20, 2) and np.all(found.control[:, 0] == 2.5)
 
 
 def test_a_policy_sees_as_far_as_it_did_in_training():
@@ -281,12 +281,11 @@ def test_a_policy_sees_as_far_as_it_did_in_training():
     acted = {}
     for sight in (12.0, np.inf):
         config = NavigationConfig(sensing=SensingConfig(range=sight))
-        pilot = collection.to_goals(
-            policy, config, None, load_vehicle(), terrain, state[[0, 1, 5]], Ahead
-        )
+        learned = policy, config, None
+        pilot = collection.to_goals(learned, load_vehicle(), terrain, state[[0, 1, 5]], Ahead)
         pilot(state)
         assert (pilot.state.observed is None) == np.isinf(sight)
-        acted[sight] = np.asarray(pilot._action)
+        acted[sight] = np.asarray(pilot.action)
     assert acted[np.inf][0] - acted[12.0][0] > 0.05
     # Of two who look at the same hills one knows that the way up costs more than its length.
     assert acted[np.inf][1] > 0.01 > abs(acted[12.0][1])

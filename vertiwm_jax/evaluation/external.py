@@ -21,10 +21,9 @@ from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl.experiment import TaskConfig
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.simulators import chrono
-from vertiwm_jax.simulators.driving import drive
 from vertiwm_jax.simulators.following import AgentPilot, Followed
 from vertiwm_jax.simulators.processes import Map
-from vertiwm_jax.simulators.protocol import Simulator
+from vertiwm_jax.simulators.protocol import Simulator, drive
 from vertiwm_jax.terrain.map import TerrainMap
 
 Arena = ModelName | Literal["chrono"]

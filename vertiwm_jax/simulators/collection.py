@@ -3,11 +3,11 @@
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.learning import schema
 from vertiwm_jax.mechanics import vehicle
-from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle
+from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig
 from vertiwm_jax.models.registry import load_encoders
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.rl.policy import load_policy
@@ -30,10 +30,9 @@ from vertiwm_jax.runs import Progress
 from vertiwm_jax.simulators import chrono, excitation, processes
 from vertiwm_jax.simulators.builtin import BuiltIn
 from vertiwm_jax.simulators.chrono import Chrono
-from vertiwm_jax.simulators.driving import Drive, Ending, Pilot, drive
 from vertiwm_jax.simulators.excitation import MARGIN, within
 from vertiwm_jax.simulators.following import AgentPilot, Followed
-from vertiwm_jax.simulators.protocol import Simulator, SimulatorError
+from vertiwm_jax.simulators.protocol import Drive, Ending, SimulatorError, drive
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import files, worlds
 from vertiwm_jax.terrain.map import TerrainMap
@@ -97,16 +96,8 @@ class CollectConfig:
         return round(self.seconds / STEP_SECONDS)
 
 
-@dataclass(frozen=True)
-class Task:
-    """One drive to record: number `drive` on the selected world of `terrain`, number `world`."""
-
-    config: CollectConfig
-    vehicle: Vehicle
-    learned: tuple[Policy, NavigationConfig, Encoders | None] | None
-    terrain: TerrainMap
-    world: int
-    drive: int
+Learned = tuple[Policy, NavigationConfig, Encoders | None]
+"""A policy, the task that it has learned, and what it sees the ground by, if it does."""
 
 
 def collect(config: CollectConfig) -> None:
@@ -114,28 +105,29 @@ def collect(config: CollectConfig) -> None:
     if config.simulator == "chrono":
         chrono.modules()
     driven = vehicle.load(config.vehicle)
-    terrain, learned = _terrain(config, driven.scale), _learned(config)
+    terrain, learned = _terrain(config, driven.scale), _learned(config, driven)
     _claim(config)
-    missing = [w for w in range(terrain.worlds) if not _file(config, w).exists()]
+    paths = [config.output / f"world_{world:03d}.npz" for world in range(terrain.worlds)]
+    missing = [world for world, path in enumerate(paths) if not path.exists()]
     tasks = (
-        Task(config, driven.vehicle, learned, alone, world, drive)
+        (alone, world, number)
         for world in missing
-        for alone in [_alone(terrain, world)]
-        for drive in range(config.drives)
+        for alone in [jax.device_get(terrain.subset(np.array([world])))]
+        for number in range(config.drives)
     )
     total = len(missing) * config.drives * config.steps
     _log.info("%d of %d worlds are left", len(missing), terrain.worlds)
     began, done = time.monotonic(), 0
     with processes.simulating(config.jobs) as mapped, Progress(total, "steps") as progress:
-        found = mapped(record_task, tasks)
+        found = mapped(partial(record, config, driven.vehicle, learned), tasks)
         for world in missing:
             drives = []
-            for drive in islice(found, config.drives):
-                drives.append(drive)
-                done += len(drive.control)
+            for one in islice(found, config.drives):
+                drives.append(one)
+                done += len(one.control)
                 progress.advance(config.steps, f"world {world}, drive {len(drives)}")
-            path = _file(config, world)
-            files.save(_alone(terrain, world), path.parent / "maps" / path.name)
+            path = paths[world]
+            files.save(terrain.select(jnp.int32(world)), path.parent / "maps" / path.name)
             meta = {
                 "map": path.name,
                 "simulator": config.simulator,
@@ -145,35 +137,42 @@ def collect(config: CollectConfig) -> None:
                 "seed": config.seed,
             }
             # Last, because by its file a world counts as done.
-            write(path, drives, config.steps, meta, driven.vehicle)
+            wheels = driven.vehicle.wheel_position
+            schema.write(path, arrays(drives, config.steps), meta, wheels)
     if done:
         _log.info("%s steps, %.0f a second", f"{done:,}", done / (time.monotonic() - began))
 
 
-def record_task(task: Task) -> Drive:
-    """The longest of a few attempts, of which the first that lasts is the last.
+def record(
+    config: CollectConfig,
+    driven: Vehicle,
+    learned: Learned | None,
+    task: tuple[TerrainMap, int, int],
+) -> Drive:
+    """The longest of a few attempts at a drive, of which the first that lasts is the last.
 
-    `SimulatorError` if none of them does a single step.
+    task: a map with the world selected, and the numbers of the world and of the drive.
+    `SimulatorError` if no attempt does a single step.
     """
-    config, tries = task.config, []
-    terrain = jax.device_put(task.terrain)
-    chrono_drives = config.simulator == "chrono"
-    simulator = Chrono(terrain) if chrono_drives else BuiltIn(terrain, task.vehicle)
+    terrain, world, number = task
+    terrain, tries = jax.device_put(terrain), []
+    over = partial(ending, *within(terrain, MARGIN))
+    simulator = Chrono(terrain) if config.simulator == "chrono" else BuiltIn(terrain, driven)
     for attempt in range(ATTEMPTS):
-        rng = np.random.default_rng([config.seed, task.world, task.drive, attempt])
+        rng = np.random.default_rng([config.seed, world, number, attempt])
         start = excitation.start(rng, terrain, config.seconds)
-        if task.learned:
-            pilot = to_goals(*task.learned, task.vehicle, terrain, start, rng)
+        if learned:
+            pilot = to_goals(learned, driven, terrain, start, rng)
         else:
-            pilot = excitation.sinusoids(rng, config.steps, float(task.vehicle.steering_limit))
-        tries.append(record(simulator, terrain, start, pilot, config.steps))
+            pilot = excitation.sinusoids(rng, config.steps, float(driven.steering_limit))
+        tries.append(drive(simulator, start, pilot, config.steps, over))
         if len(tries[-1].control) >= SHORTEST * config.steps:
             break
-    longest = max(tries, key=lambda drive: len(drive.control))
+    longest = max(tries, key=lambda one: len(one.control))
     if not len(longest.control):
         raise SimulatorError(
-            f"world {task.world}: drive {task.drive}: expected a step or more, found none in "
-            f"{ATTEMPTS} attempts ({longest.ending})"
+            f"world {world}: drive {number}: expected a step or more, found none in {ATTEMPTS} "
+            f"attempts ({longest.ending})"
         )
     return longest
 
@@ -183,16 +182,15 @@ def _terrain(config: CollectConfig, scale: float) -> TerrainMap:
     if config.terrain:
         return files.load_map(config.terrain, scale=scale, obstacles=config.obstacles)
     count = config.repeats * len(config.difficulties) * len(config.kinds)
-    keys = jax.random.split(jax.random.key(config.seed), count)
-    return worlds.generate(keys, WorldConfig(config.difficulties, config.kinds), scale)
+    drawn = WorldConfig(config.difficulties, config.kinds)
+    return worlds.make_worlds(count, config.seed, drawn, scale=scale)
 
 
-def _learned(config: CollectConfig) -> tuple[Policy, NavigationConfig, Encoders | None] | None:
-    """What the run has learned, in host memory, how it is to be driven, and what it sees by."""
-    run = config.policy
-    if run is None:
+def _learned(config: CollectConfig, driven: VehicleConfig) -> Learned | None:
+    """What the run has learned, in host memory."""
+    if config.policy is None:
         return None
-    policy = load_policy(run).on(vehicle.load(config.vehicle))
+    policy = load_policy(config.policy).on(driven)
     seen_by = load_encoders(policy.config.weights) if policy.task.embeddings else None
     acting, seen_by = jax.device_get((policy.acting, seen_by))
     return acting, policy.task, seen_by
@@ -214,80 +212,40 @@ def _claim(config: CollectConfig) -> None:
             raise ConfigError(f"{file}: {name}: expected {was} as before, found {found}")
 
 
-def _file(config: CollectConfig, world: int) -> Path:
-    return config.output / f"world_{world:03d}.npz"
-
-
-def _alone(terrain: TerrainMap, world: int) -> TerrainMap:
-    """One world of several, in host memory."""
-    return jax.device_get(terrain.subset(np.array([world])))
-
-
-def record(
-    simulator: Simulator,
-    terrain: TerrainMap,
-    start: Sequence[float],
-    pilot: Pilot,
-    steps: int,
-) -> Drive:
-    """Drives until `steps` are done, or the vehicle leaves the map or rolls over.
-
-    terrain: what the simulator drives on. A state that diverged is left out.
-    """
-    return drive(simulator, start, pilot, steps, partial(_ending, *within(terrain, MARGIN)))
-
-
 def to_goals(
-    policy: Policy,
-    config: NavigationConfig,
-    encoders: Encoders | None,
-    vehicle: Vehicle,
+    learned: Learned,
+    driven: Vehicle,
     terrain: TerrainMap,
     start: Sequence[float],
     rng: np.random.Generator,
 ) -> AgentPilot:
     """A policy as the pilot of a drive from goal to goal on the selected world.
 
-    Args:
-        policy: what drives.
-        config: the task that it has learned.
-        encoders: what it sees embeddings of the ground by; None if it sees none.
-        vehicle: what is driven.
-        terrain: where.
-        start: x, y, m, and yaw, rad.
-        rng: draws the goals.
+    start: x, y, m, and yaw, rad; rng: draws the goals.
     """
+    policy, config, encoders = learned
     env = NavigationEnv(Followed(), replace(config, settle_steps=0))
     next_goal = partial(excitation.next_goal, rng, terrain)
     place = jnp.asarray([start], jnp.float32)
     goal = jnp.asarray(next_goal(np.asarray(place[0, :2]))[None, :2])
     one = Tasks(jnp.reshape(terrain.world, 1), place[:, :2], place[:, 2], goal)
-    task = env.make_params(jnp.zeros(12), terrain, one, vehicle, encoders)
+    task = env.make_params(jnp.zeros(12), terrain, one, driven, encoders)
     at_start = jax.tree.map(lambda x: x[0], task.starts)
     # No learned policy is random.
     return AgentPilot(env, task, Reactive(policy), at_start, jax.random.key(0), next_goal)
 
 
-def write(
-    path: Path, drives: Sequence[Drive], steps: int, meta: dict[str, Any], vehicle: Vehicle
-) -> None:
-    """A file of the schema with K drives of a vehicle, each filled up to `steps`.
-
-    meta: holds "map", the file name of the terrain map.
-    """
-    arrays = schema.join([_arrays(drive) for drive in drives], steps)
-    arrays["ending"] = np.array([drive.ending for drive in drives])
-    schema.write(path, arrays, meta, vehicle.wheel_position)
+def arrays(drives: Sequence[Drive], steps: int) -> dict[str, np.ndarray]:
+    """K drives as arrays of the schema, each filled up to `steps`, and how each of them ended."""
+    parts = []
+    for one in drives:
+        seen = jax.tree.map(lambda *x: np.stack(x), *one.observations)
+        known = {name: x for name, x in vars(seen.wheels).items() if x is not None}
+        parts.append(schema.drive(seen.state, one.control, wheel_class=seen.wheel_class, **known))
+    return {**schema.join(parts, steps), "ending": np.array([one.ending for one in drives])}
 
 
-def _arrays(drive: Drive) -> dict[str, np.ndarray]:
-    """A drive as arrays of the schema."""
-    seen = jax.tree.map(lambda *x: np.stack(x), *drive.observations)
-    known = {name: x for name, x in vars(seen.wheels).items() if x is not None}
-    return schema.drive(seen.state, drive.control, wheel_class=seen.wheel_class, **known)
-
-
-def _ending(low: np.ndarray, high: np.ndarray, state: np.ndarray) -> Ending | None:
+def ending(low: np.ndarray, high: np.ndarray, state: np.ndarray) -> Ending | None:
     """Why a drive cannot go on, if it cannot; low, high: `[2]` m, where it may be."""
     if not np.isfinite(state).all() or np.linalg.norm(state[6:9]) > LARGEST_SPEED:
         return "diverged"

@@ -1,7 +1,7 @@
 """The navigation task of a vehicle that a simulator outside jit moves, and agents that drive it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import jax
@@ -34,64 +34,58 @@ class Followed:
         return VehicleState.from_vector(params), ()
 
 
+@dataclass
 class AgentPilot:
-    """An agent that commands a vehicle in a simulator outside jit, see `driving.drive`.
+    """An agent that commands a vehicle in a simulator outside jit, see `protocol.drive`.
 
-    state: of the task, as it goes on; path: position and roll, pitch, yaw `[6]` of all its states.
+    env: the task, with the dynamics `Followed`; task: what it is run with.
+    agent: what drives.
+    state: of the task, as it goes on. At first a start of the pool, whose vehicle is replaced by
+        the one that is seen.
+    key: of all that is random.
+    next_goal: draws the goal `[3]`, m, that follows one that is reached at `[2]` x, y, m. Without
+        it the drive ends with the episode.
+    path: position and roll, pitch, yaw `[6]` of all its states.
+    memory, action: the last ones; None before the first.
     """
 
-    def __init__(
-        self,
-        env: NavigationEnv,
-        task: TaskParams,
-        agent: Agent,
-        start: TaskState,
-        key: jax.Array,
-        next_goal: Callable[[np.ndarray], np.ndarray] | None = None,
-    ) -> None:
-        """`AgentPilot` of one episode, or of a drive from goal to goal.
-
-        Args:
-            env: the task, with the dynamics `Followed`.
-            task: what it is run with.
-            agent: what drives.
-            start: a start of the pool, whose vehicle is replaced by the one that is seen.
-            key: of all that is random.
-            next_goal: draws the goal `[3]`, m, that follows one that is reached at `[2]` x, y, m.
-                Without it the drive ends with the episode.
-        """
-        self.state, self.path = start, list[np.ndarray]()
-        self._env, self._task, self._agent, self._key = env, task, agent, key
-        self._next_goal = next_goal
-        self._memory: Memory = None
-        self._action: jax.Array | None = None
+    env: NavigationEnv
+    task: TaskParams
+    agent: Agent
+    state: TaskState
+    key: jax.Array
+    next_goal: Callable[[np.ndarray], np.ndarray] | None = None
+    path: list[np.ndarray] = field(default_factory=list)
+    memory: Memory = None
+    action: jax.Array | None = None
 
     def __call__(self, seen: np.ndarray) -> np.ndarray | None:
         """The command `[2]` at the state `[12]` that the vehicle is in; None once all is over."""
-        env, vehicle = self._env, jnp.asarray(seen)
-        task = replace(self._task, dynamics=vehicle)
+        env, vehicle = self.env, jnp.asarray(seen)
+        task = replace(self.task, dynamics=vehicle)
         step = len(self.path)
-        plan_key, act_key = jax.random.split(jax.random.fold_in(self._key, step))
-        if self._action is None:
+        plan_key, act_key = jax.random.split(jax.random.fold_in(self.key, step))
+        if self.action is None:
             now = begin(env, task, self.state, vehicle)
         else:
-            now = _follow(env, task, self.state, self._action, act_key)
-        if self._next_goal:
-            now = self._from_goal_to_goal(now, self._next_goal)
+            observation, state, *_ = _step(env, act_key, self.state, self.action, task)
+            now = Now(task, state, observation)
+        if self.next_goal:
+            now = self._from_goal_to_goal(now, self.next_goal)
         self.state = now.state
         self.path.append(np.concatenate([now.state.vehicle.position, now.state.vehicle.rpy]))
         if now.state.ending != TerminationReason.RUNNING:
             return None
-        if self._action is None:
-            self._memory = _init(self._agent, now)
-        plans, keys = step % self._agent.interval == 0, (plan_key, act_key)
-        action, self._memory = _decide(self._agent, now, self._memory, keys, plans)
-        self._action = action
+        if self.action is None:
+            self.memory = _init(self.agent, now)
+        plans, keys = step % self.agent.interval == 0, (plan_key, act_key)
+        action, self.memory = _decide(self.agent, now, self.memory, keys, plans)
+        self.action = action
         return command(env, task, action)
 
     def _from_goal_to_goal(self, now: Now, draw: Callable[[np.ndarray], np.ndarray]) -> Now:
         """The same, as if the episode had begun here, with another goal where one is reached."""
-        zero, config = jnp.int32(0), self._env.config
+        zero, config = jnp.int32(0), self.env.config
         state = replace(now.state, ending=zero, stalled=zero, time=zero)
         place = np.asarray(state.vehicle.position)
         if np.linalg.norm(state.goal - place) >= config.goal_radius:
@@ -99,9 +93,9 @@ class AgentPilot:
         goal = jnp.asarray(draw(place[:2]), jnp.float32)
         terrain = now.task.terrain.select(state.world)
         routes = _route(config, terrain, now.task.vehicle, goal[:2])
-        self._task = replace(self._task, routes=routes)
+        self.task = replace(self.task, routes=routes)
         state = replace(state, goal=goal, route=zero)
-        return begin(self._env, replace(now.task, routes=routes), state, now.task.dynamics)
+        return begin(self.env, replace(now.task, routes=routes), state, now.task.dynamics)
 
 
 @partial(jax.jit, static_argnames="env")
@@ -113,21 +107,9 @@ def begin(env: NavigationEnv, task: TaskParams, state: TaskState, seen: jax.Arra
     return Now(task, state, env.observe(None, state, None, task))
 
 
-@partial(jax.jit, static_argnames="env")
-def _follow(
-    env: NavigationEnv, task: TaskParams, state: TaskState, action: jax.Array, key: jax.Array
-) -> Now:
-    """The task after the vehicle has moved."""
-    observation, state, *_ = env.step_env(key, state, action, task)
-    return Now(task, state, observation)
-
-
+_step = jax.jit(NavigationEnv.step_env, static_argnums=0)
 _route = jax.jit(NavigationConfig.route_to, static_argnums=0)
-
-
-@jax.jit
-def _init(agent: Agent, now: Now) -> Memory:
-    return agent.init(now)
+_init = jax.jit(lambda agent, now: agent.init(now))
 
 
 @partial(jax.jit, static_argnames="plans")
