@@ -277,5 +277,5 @@ def test_a_patch_must_cover_the_next_footprint():
 def test_a_model_that_cannot_stand_is_named():
     env = NavigationEnv(KinematicBicycle())
     broken = BICYCLE.replace(wheelbase=jnp.float32(jnp.nan))
-    with pytest.raises(ValueError, match=r"dynamics: expected a finite state .* in task 0"):
+    with pytest.raises(ValueError, match=r"dynamics: expected a finite state .*; task 0 has"):
         env.make_params(broken, ground(), task((0.0, 0.0), (30.0, 0.0)))

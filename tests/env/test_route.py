@@ -8,8 +8,7 @@ from env.worlds import GRASS, ground, hills
 from scipy.sparse import csgraph
 
 from vertiwm_jax.env import route
-from vertiwm_jax.env.route import RouteConfig
-from vertiwm_jax.env.traversability import TraversabilityCost, footprint, places
+from vertiwm_jax.env.route import RouteConfig, TraversabilityCost, footprint, places
 from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.map import TerrainMap

@@ -148,7 +148,7 @@ def test_a_map_of_which_a_part_is_known():
     def of_all(look):
         def seen(state):
             pose = state.position, state.rpy[2]
-            known = replace(terrain, observed=sensing.init(config, terrain, *pose))
+            known = replace(terrain, observed=sensing.look(config, terrain, *pose))
             return look(PAIRS["shared"], known, state)
 
         return jax.jit(jax.vmap(seen))(states)

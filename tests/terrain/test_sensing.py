@@ -17,8 +17,7 @@ DISC = SensingConfig(range=12.0)
 SECTOR = SensingConfig(range=15.0, field_of_view=2.0, cells=40)
 ROCKS = np.array([[9.0, 2.0, 4.0, 4.0, 2.0], [14.0, 0.0, 5.0, 5.0, 2.0]], np.float32)
 POSES = [(0.0, 0.0, 0.3), (4.0, -3.0, 2.5), (-50.0, 60.0, -1.0)]
-update = jax.jit(sensing.update, static_argnums=0)
-init = jax.jit(sensing.init, static_argnums=0)
+look = jax.jit(sensing.look, static_argnums=0)
 
 
 def world(elevation=None, origin=(-60.0, 62.0)):
@@ -32,10 +31,9 @@ def at(x, y, yaw):
 
 
 def along(config, terrain, poses):
-    observed = init(config, terrain, *at(*poses[0]))
-    for pose in poses[1:]:
-        observed = update(config, terrain, observed, *at(*pose))
-    return observed
+    for pose in poses:
+        terrain = replace(terrain, observed=look(config, terrain, *at(*pose)))
+    return terrain.observed
 
 
 def seen_from(config, x, y, yaw, origin=(-60.0, 62.0), side=128.0):
@@ -76,7 +74,7 @@ def test_cells_become_known_as_counted_one_by_one_and_stay_so(config):
 def test_unknown_ground_lies_in_the_plane_through_what_is_seen():
     """By scipy: heights between vertices, and least squares in world coordinates."""
     terrain, (x, y, yaw) = world(), POSES[1]
-    observed = init(SECTOR, terrain, *at(x, y, yaw))
+    observed = look(SECTOR, terrain, *at(x, y, yaw))
     forward, left = np.stack(sensing._places(SECTOR)).astype(np.float64)
     assert np.hypot(forward, left).max() < SECTOR.range
     xy = np.stack(
@@ -110,7 +108,7 @@ def test_an_incline_goes_on_as_far_as_the_map(config):
 
 def test_unknown_ground_is_like_that_below_and_what_is_known_is_as_it_is():
     terrain, (x, y, yaw) = world(), POSES[0]
-    observed_map = replace(terrain, observed=init(DISC, terrain, *at(x, y, yaw)))
+    observed_map = replace(terrain, observed=look(DISC, terrain, *at(x, y, yaw)))
     below = query.surface(terrain, jnp.array([x, y]))
     far = query.surface(observed_map, jnp.array([[40.0, 40.0], [48.0, 40.0]]))
     np.testing.assert_array_equal(far.semantic, below.semantic)
@@ -126,7 +124,7 @@ def test_rocks_are_there_once_their_middle_is_seen():
     yaw = jnp.zeros(2)
     assert obstacles.collides(terrain, poses, yaw, 4.6, 2.2).all()
     for pose, expected in ((POSES[0], [True, False]), (POSES[2], [False, False])):
-        observed_map = replace(terrain, observed=init(DISC, terrain, *at(*pose)))
+        observed_map = replace(terrain, observed=look(DISC, terrain, *at(*pose)))
         np.testing.assert_array_equal(
             obstacles.collides(observed_map, poses, yaw, 4.6, 2.2), expected
         )
@@ -161,7 +159,7 @@ def test_many_vehicles_on_many_worlds_are_each_their_own_in_one_program():
     def height(worlds, positions, yaws):
         def one(world, position, yaw):
             ground = terrain.select(world)
-            observed = sensing.init(SECTOR, ground, position, yaw)
+            observed = sensing.look(SECTOR, ground, position, yaw)
             return observed, query.height(
                 replace(ground, observed=observed), jnp.array([20.0, 0.0])
             )
@@ -174,7 +172,7 @@ def test_many_vehicles_on_many_worlds_are_each_their_own_in_one_program():
         found = height(jnp.array(worlds), *stacked)
         for i, (number, pose) in enumerate(zip(worlds, poses, strict=True)):
             ground = terrain.select(jnp.int32(number))
-            observed = init(SECTOR, ground, *pose)
+            observed = look(SECTOR, ground, *pose)
             alone = (
                 observed,
                 query.height(replace(ground, observed=observed), jnp.array([20.0, 0.0])),
@@ -195,4 +193,3 @@ def test_what_has_no_sense_is_refused():
         sensing.check(SensingConfig(range=12.0, cells=16), world())
     sensing.check(SensingConfig(range=12.0, cells=23), world())
     sensing.check(SensingConfig(cells=1), world())
-    assert init(SensingConfig(), world(), *at(*POSES[0])) is None

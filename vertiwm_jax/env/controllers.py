@@ -7,8 +7,8 @@ from flax import struct
 
 from vertiwm_jax.env.agent import Policy
 from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, GOAL, ROUTE_SCALE, arcs_ahead
+from vertiwm_jax.env.route import TraversabilityCost
 from vertiwm_jax.env.task import NavigationConfig
-from vertiwm_jax.env.traversability import TraversabilityCost
 from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
 
 REFERENCE = "straight to goal"

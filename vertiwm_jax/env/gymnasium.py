@@ -10,13 +10,13 @@ from gymnasium.vector.utils import batch_space
 from gymnax.environments.spaces import gymnax_space_to_gym_space
 
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.render import from_above
 from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain import picture as pictures
 
+_VEHICLE, _GOAL = (0.80, 0.05, 0.05), (0.00, 0.25, 0.75)  # red, blue
 _ENDINGS = np.array([reason.name.lower() for reason in TerminationReason])
-
 
 # Equal environments share what these compile.
 _reset = jax.jit(NavigationEnv.reset_env, static_argnums=0)
@@ -68,8 +68,7 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """`[H, W, 3]` uint8, north up, or None without a render mode."""
         if self.render_mode is None or self._state is None:
             return None
-        radius = self._env.config.goal_radius
-        return from_above(self._params.terrain, self._params.vehicle, self._state, radius)
+        return _from_above(self._env.config.goal_radius, self._params, self._state)
 
     def _start(self) -> tuple[jax.Array, TaskState]:
         return _reset(self._env, self._key, self._params)
@@ -138,3 +137,24 @@ def _named(info: dict[str, Any]) -> dict[str, Any]:
 def _with_masks(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
     """Adds Gymnasium's masks: for which environments each entry holds."""
     return info | {f"_{name}": mask.copy() for name in info}
+
+
+def _from_above(goal_radius: float, params: TaskParams, state: TaskState) -> np.ndarray:
+    """`[H, W, 3]` uint8, north up: the vehicle as a red box with a white nose, the goal a ring."""
+    terrain, vehicle = params.terrain, params.vehicle
+    picture = pictures.shaded(terrain, int(state.world))
+    west, east, south, north = pictures.extent(terrain)
+    (east_of, north_of, _), yaw = np.asarray(state.vehicle.position), float(state.vehicle.rpy[2])
+    goal = np.asarray(state.goal)
+    height, width, _ = picture.shape
+    x = west + (np.arange(width) + 0.5) * (east - west) / width
+    y = (north - (np.arange(height) + 0.5) * (north - south) / height)[:, None]
+    pixel = (east - west) / width
+    ring = np.abs(np.hypot(x - goal[0], y - goal[1]) - goal_radius) < 1.5 * pixel
+    picture[ring] = _GOAL
+    ahead = np.cos(yaw) * (x - east_of) + np.sin(yaw) * (y - north_of)
+    left = np.cos(yaw) * (y - north_of) - np.sin(yaw) * (x - east_of)
+    body = (np.abs(ahead) <= vehicle.length / 2) & (np.abs(left) <= vehicle.width / 2)
+    picture[body] = _VEHICLE
+    picture[body & (ahead > vehicle.length / 4)] = 1.0
+    return (255 * picture).round().astype(np.uint8)

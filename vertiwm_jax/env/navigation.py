@@ -103,7 +103,15 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         if settled:
             settle = parallel.shared_out(partial(_settle_once, self), together)
             starts, seen = parallel.in_turns(lambda x: settle(params, *x), numbered, together)
-            _check_finite(starts, tasks, config)
+            states = np.asarray(starts.vehicle.vector)
+            finite = np.isfinite(states).all(axis=-1)
+            if not finite.all():
+                i = int(np.argmin(finite))
+                raise TaskError(
+                    f"dynamics: expected a finite state after {config.settle_steps} steps of "
+                    f"standing still, found {states[i]}; {tasks.told(i)}; {np.sum(~finite)} of "
+                    f"{pool} tasks are so"
+                )
         else:
             # As they will settle, so that it is traced only once.
             mesh, some = parallel.mesh(together), jax.tree.map(lambda x: x[:together], numbered)
@@ -165,7 +173,13 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         moved, history = step(self.dynamics, *given)
         running = state.ending == TerminationReason.RUNNING
         apart = disagreement(history)
-        plausible = self._is_plausible(terrain, moved, apart)
+        off_ground = moved.position[2] - query.height(terrain, moved.position[:2])
+        plausible = (
+            jnp.all(jnp.isfinite(moved.vector))
+            & (jnp.linalg.norm(moved.velocity) <= config.plausible_speed)
+            & (jnp.abs(off_ground) <= config.plausible_height)
+            & (apart <= config.plausible_disagreement)
+        )
         vehicle, action = jax.tree.map(
             lambda new, old: jnp.where(running & plausible, new, old),
             (moved, action),
@@ -209,7 +223,8 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         gain = jnp.where(running, gain, 0.0)
         observed = state.observed
         if observed is not None:
-            seen = sensing.update(config.sensing, terrain, observed, vehicle.position, yaw)
+            known = params.observed_map(state)
+            seen = sensing.look(config.sensing, known, vehicle.position, yaw)
             observed = jax.tree.map(partial(jnp.where, running), seen, observed)
         new = dataclasses.replace(
             state,
@@ -272,17 +287,6 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         limit, size = observation.OBSERVATION_LIMIT, self.config.observed.size
         return spaces.Box(-limit, limit, (size,), jnp.float32)
 
-    def _is_plausible(
-        self, terrain: TerrainMap, vehicle: VehicleState, apart: jax.Array
-    ) -> jax.Array:
-        off_ground = vehicle.position[2] - query.height(terrain, vehicle.position[:2])
-        return (
-            jnp.all(jnp.isfinite(vehicle.vector))
-            & (jnp.linalg.norm(vehicle.velocity) <= self.config.plausible_speed)
-            & (jnp.abs(off_ground) <= self.config.plausible_height)
-            & (apart <= self.config.plausible_disagreement)
-        )
-
 
 @partial(jax.jit, static_argnames="env")
 def _settle(
@@ -315,6 +319,9 @@ def _settle(
     ) -> tuple[TaskState, jax.Array]:
         (vehicle, history), terrain = placed, params.terrain.select(task.world)
         action, zero = params.vehicle.action(standing(), config.speed_range), jnp.int32(0)
+        seen = None
+        if config.sensing.partial:
+            seen = sensing.look(config.sensing, terrain, vehicle.position, vehicle.rpy[2])
         state = TaskState(
             time=zero,
             vehicle=vehicle,
@@ -326,7 +333,7 @@ def _settle(
             stalled=zero,
             ending=zero,
             variation=DomainRandomization.draw(env.variation, jax.random.key(0), action),
-            observed=sensing.init(config.sensing, terrain, vehicle.position, vehicle.rpy[2]),
+            observed=seen,
         )
         return state, env.observe(None, state, None, params)
 
@@ -342,20 +349,6 @@ def _settle(
 
 # Apart, for what is traced inside of something else, as for its shapes, has no compiler options.
 _settle_once = xla.brief_jit(_settle, static_argnames="env")
-
-
-def _check_finite(starts: TaskState, tasks: Tasks, config: NavigationConfig) -> None:
-    """`TaskError` names the first task whose settled state is not finite."""
-    states = np.asarray(starts.vehicle.vector)
-    finite = np.all(np.isfinite(states), axis=-1)
-    if not finite.all():
-        i = int(np.argmin(finite))
-        raise TaskError(
-            f"dynamics: expected a finite state after {config.settle_steps} steps of standing "
-            f"still, found {states[i]} in task {i} (world {int(tasks.world[i])}, start "
-            f"{np.asarray(tasks.start)[i].tolist()}); {np.sum(~finite)} of {finite.size} tasks "
-            "are so"
-        )
 
 
 def make_env(

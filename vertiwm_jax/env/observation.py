@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.env.route import CLEARANCE, Routes
+from vertiwm_jax.env import route
+from vertiwm_jax.env.route import Routes, footprint, places
 from vertiwm_jax.env.termination import edge_distance
-from vertiwm_jax.env.traversability import CROWN_SCALE, SLOPE_SCALE, TWIST_SCALE, footprint, places
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.networks.policy import Candidates, ObservationLayout, tiles
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
@@ -67,10 +67,10 @@ LAYOUT = {
     "goal bearing": Part(slice(9, 11), "cosine and sine", 1.0),
     "last action": Part(slice(11, 13), "speed and steering in [-1, 1]", 1.0),
     "height": _of_places(0, "m", _HEIGHT_SCALE),
-    "crown": _of_places(1, "m", CROWN_SCALE),
-    "rise": _of_places(2, "m/m", SLOPE_SCALE),
-    "bank": _of_places(3, "m/m", SLOPE_SCALE),
-    "twist": _of_places(4, "m/m", TWIST_SCALE),
+    "crown": _of_places(1, "m", route.CROWN_SCALE),
+    "rise": _of_places(2, "m/m", route.SLOPE_SCALE),
+    "bank": _of_places(3, "m/m", route.SLOPE_SCALE),
+    "twist": _of_places(4, "m/m", route.TWIST_SCALE),
     "route": _of_places(5, "m", ROUTE_SCALE),
     "friction": Part(slice(GROUND.stop, OBSERVATION_SIZE, 2), "1", 1.0),
     "sinkage": Part(slice(GROUND.stop + 1, OBSERVATION_SIZE, 2), "m", _SINKAGE_SCALE),
@@ -200,14 +200,14 @@ def observe(
     place, heading = poses_ahead(vehicle)
     xy = at(place)
     under = footprint(vehicle, query.height(terrain, at(places(vehicle, place, heading))))
-    size = vehicle.length + 2 * CLEARANCE, vehicle.width + 2 * CLEARANCE
+    size = vehicle.length + 2 * route.CLEARANCE, vehicle.width + 2 * route.CLEARANCE
     blocked = obstacles.collides(terrain, xy, yaw + heading, *size)
     # Heights repeat beyond the edge of the map, which would look like the best of roads.
     blocked |= edge_distance(terrain, xy) < 0
     cost = routes.cost_to_go(terrain, xy)
     ground = (
         (under.mean - state.position[2]) / _HEIGHT_SCALE,
-        jnp.where(blocked, _WALL / CROWN_SCALE, under.crown),
+        jnp.where(blocked, _WALL / route.CROWN_SCALE, under.crown),
         under.rise,
         under.bank,
         under.twist,

@@ -1,4 +1,4 @@
-"""Routes over known ground: the cost of driving on to a goal from anywhere.
+"""How hard ground is to drive on, and what it costs to drive on to a goal from anywhere.
 
 A route goes through the middles of cells that tile the map, by moves to sixteen cells around. A
 move costs its length, and more where the ground would tilt, twist or ground the vehicle, or where
@@ -7,7 +7,7 @@ value iteration).
 """
 
 import functools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Self
 
 import jax
@@ -18,18 +18,87 @@ from flax import struct
 from vertiwm_jax import machine, parallel
 from vertiwm_jax.config import Bounds, NotNegative, settings
 from vertiwm_jax.env.termination import edge_distance
-from vertiwm_jax.env.traversability import TraversabilityCost, footprint, places
 from vertiwm_jax.mechanics.vehicle import Vehicle
-from vertiwm_jax.terrain import obstacles, query
+from vertiwm_jax.terrain import _raster, obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
 
 CLEARANCE = 0.3
 """Clearance to obstacles, m."""
+SLOPE_SCALE = 0.4
+TWIST_SCALE = 0.2
+CROWN_SCALE = 0.2  # m
 _MOVES = np.array([(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)])
 _PLACES = np.array([0.0, 0.5, 1.0])  # of a move, where the ground is looked at
 _ROUNDS = 16  # of value iteration, before it is looked whether anything still changes
 _REACH = 2  # cells, of the longest moves along an axis
 _NEAR = 1.5  # cells from a goal within which the way to it is straight
+
+
+@struct.dataclass
+class Footprint:
+    """The ground below a vehicle, leaves `[...]`.
+
+    mean: height under the wheels, m.
+    crown: height of the ground between the wheels above that, which the belly touches, over 0.2 m.
+    rise, bank: slopes from rear to front and from right to left, over 0.4.
+    twist: difference of the slopes at both axles, which lifts wheels, over 0.2.
+    """
+
+    mean: jax.Array
+    crown: jax.Array
+    rise: jax.Array
+    bank: jax.Array
+    twist: jax.Array
+
+
+def places(
+    vehicle: Vehicle, xy: jax.Array | np.ndarray, heading: jax.Array | np.ndarray
+) -> jax.Array:
+    """The middles and wheels of vehicles at `[..., 2]`, m, with `[...]` heading: `[5, ..., 2]`."""
+    cos, sin = jnp.cos(heading), jnp.sin(heading)
+    forward = jnp.stack([cos, sin], axis=-1) * vehicle.wheelbase / 2
+    left = jnp.stack([-sin, cos], axis=-1) * vehicle.track / 2
+    corners = (forward + left, forward - left, -forward + left, -forward - left)
+    return jnp.stack([xy, *(xy + corner for corner in corners)])
+
+
+def footprint(vehicle: Vehicle, heights: jax.Array) -> Footprint:
+    """Of heights `[5, ...]`, m, at `places`."""
+    middle, fl, fr, rl, rr = heights
+    mean = (fl + fr + rl + rr) / 4
+    return Footprint(
+        mean=mean,
+        crown=(middle - mean) / CROWN_SCALE,
+        rise=(fl + fr - rl - rr) / (2 * vehicle.wheelbase * SLOPE_SCALE),
+        bank=(fl + rl - fr - rr) / (2 * vehicle.track * SLOPE_SCALE),
+        twist=(fl + rr - fr - rl) / (2 * vehicle.track * TWIST_SCALE),
+    )
+
+
+@dataclass(frozen=True)
+class TraversabilityCost:
+    """The difficulty of ground.
+
+    bank, rise, twist, crown: weights of the squares of the parts of a `Footprint`.
+    tolerated: bank and rise that cost nothing.
+    """
+
+    bank: float = 1.0
+    rise: float = 1.45
+    twist: float = 2.3
+    crown: float = 1.1
+    tolerated: float = 0.4
+
+    def __call__(
+        self, crown: jax.Array, rise: jax.Array, bank: jax.Array, twist: jax.Array
+    ) -> jax.Array:
+        """`[...]`, 0 on ground that is level."""
+        return (
+            self.bank * jnp.maximum(jnp.abs(bank) - self.tolerated, 0.0) ** 2
+            + self.rise * jnp.maximum(jnp.abs(rise) - self.tolerated, 0.0) ** 2
+            + self.twist * twist**2
+            + self.crown * jnp.maximum(crown, 0.0) ** 2
+        )
 
 
 @settings
@@ -72,11 +141,7 @@ class Routes:
         corner = jnp.minimum(place.astype(jnp.int32), cells - 2)
         across, down = jnp.moveaxis(place - corner, -1, 0)
         index = (self.number * cells + corner[..., 1]) * cells + corner[..., 0]
-        flat = self.cost.reshape(-1)
-
-        def at(index: jax.Array) -> jax.Array:
-            return flat.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
+        at = functools.partial(_raster.gather, self.cost)
         upper = at(index) * (1 - across) + at(index + 1) * across
         lower = at(index + cells) * (1 - across) + at(index + cells + 1) * across
         return upper * (1 - down) + lower * down

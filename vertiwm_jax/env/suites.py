@@ -61,6 +61,11 @@ class Tasks:
     yaw: jax.Array
     goal: jax.Array
 
+    def told(self, i: int) -> str:
+        """Task i in words."""
+        world, start, yaw, goal = (np.asarray(x)[i].tolist() for x in vars(self).values())
+        return f"task {i} has world {world}, start {start}, goal {goal}, yaw {yaw:g}"
+
 
 @settings
 class GroundConfig:
@@ -145,9 +150,8 @@ def training_tasks(
 def test_tasks(config: GroundConfig, terrain: TerrainMap) -> Tasks:
     """Tasks across the circle of every world, 60 m in radius where the map is large enough."""
     half = float(terrain.size.min()) / 2
-    return circle_tasks(
-        terrain, min(worlds.START_RADIUS, 15 / 16 * half), config.pairs, config.sway
-    )
+    radius = min(worlds.START_RADIUS, 15 / 16 * half)
+    return circle_tasks(terrain, radius, config.pairs, config.sway)
 
 
 def circle_tasks(
@@ -265,10 +269,7 @@ def _draw(
     return jax.lax.map(draw, (jax.random.split(key, count), world), batch_size=together)
 
 
-@jax.jit
-def _edge_distances(terrain: TerrainMap, tasks: Tasks) -> tuple[jax.Array, jax.Array]:
-    """Of starts and goals, m."""
-    return edge_distance(terrain, tasks.start), edge_distance(terrain, tasks.goal)
+_edge_distance = jax.jit(edge_distance)
 
 
 def validate(tasks: Tasks, terrain: TerrainMap, goal_radius: float, margin: float) -> None:
@@ -277,7 +278,7 @@ def validate(tasks: Tasks, terrain: TerrainMap, goal_radius: float, margin: floa
     Starts must lie `margin` m inside the map and farther than `goal_radius` m from the goal.
     """
     world = np.asarray(tasks.world)
-    start_edge, goal_edge = map(np.asarray, _edge_distances(terrain, tasks))
+    start_edge, goal_edge = (_edge_distance(terrain, xy) for xy in (tasks.start, tasks.goal))
     distance = np.linalg.norm(np.asarray(tasks.goal - tasks.start), axis=-1)
     # Negated, so that NaN fails.
     checks = {
@@ -289,9 +290,4 @@ def validate(tasks: Tasks, terrain: TerrainMap, goal_radius: float, margin: floa
     }
     for message, bad in checks.items():
         if bad.any():
-            i = int(np.argmax(bad))
-            raise TaskError(
-                f"tasks.{message}; task {i} has world {world[i]}, "
-                f"start {np.asarray(tasks.start)[i].tolist()}, "
-                f"goal {np.asarray(tasks.goal)[i].tolist()}, yaw {float(tasks.yaw[i]):g}"
-            )
+            raise TaskError(f"tasks.{message}; {tasks.told(int(np.argmax(bad)))}")

@@ -1,6 +1,7 @@
 """How an episode ends."""
 
 import enum
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -27,12 +28,9 @@ def first_ending(conditions: dict[TerminationReason, jax.Array]) -> jax.Array:
     The largest code is the most severe: a vehicle that reaches the goal on its roof has rolled
     over.
     """
-    order = sorted(conditions, reverse=True)
-    return jnp.select(
-        [conditions[ending] for ending in order],
-        [jnp.int32(ending) for ending in order],
-        jnp.int32(TerminationReason.RUNNING),
-    )
+    running = jnp.int32(TerminationReason.RUNNING)
+    found = [jnp.where(holds, jnp.int32(code), running) for code, holds in conditions.items()]
+    return functools.reduce(jnp.maximum, found)
 
 
 def is_terminal(ending: jax.Array) -> jax.Array:

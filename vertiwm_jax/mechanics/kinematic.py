@@ -13,6 +13,9 @@ from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
 
+SPEED_LAG = 0.2
+"""s, by which an HMMWV in Chrono follows its commanded speed."""
+
 
 @dataclass(frozen=True)
 class ConstantVelocity:
@@ -44,17 +47,10 @@ class BicycleParams:
     speed_lag: jax.Array
 
 
-def bicycle_of(vehicle: Vehicle, speed_lag: float = 0.2) -> BicycleParams:
-    """The bicycle with the axles of `vehicle` that rides as its springs carry it.
-
-    speed_lag: s, as an HMMWV drives in Chrono.
-    """
-    return BicycleParams(
-        wheelbase=jnp.asarray(vehicle.wheelbase),
-        track=jnp.asarray(vehicle.track),
-        ride_height=jnp.asarray(vehicle.ride_height),
-        speed_lag=jnp.float32(speed_lag),
-    )
+def bicycle_of(vehicle: Vehicle) -> BicycleParams:
+    """The bicycle with the axles of `vehicle` that rides as its springs carry it."""
+    numbers = vehicle.wheelbase, vehicle.track, vehicle.ride_height, SPEED_LAG
+    return BicycleParams(*map(jnp.float32, numbers))
 
 
 @dataclass(frozen=True)

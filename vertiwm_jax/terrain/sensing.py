@@ -46,35 +46,24 @@ def check(config: SensingConfig, terrain: TerrainMap) -> None:
         )
 
 
-def init(
+def look(
     config: SensingConfig, terrain: TerrainMap, position: jax.Array, yaw: jax.Array
-) -> ObservedMap | None:
-    """What is known at first, at `[3]` p_world, m, and `[]` yaw, rad; None if all is known."""
-    if not config.partial:
-        return None
-    below = query.surface(terrain, position[:2])
-    nothing = ObservedMap(
-        known=jnp.zeros((config.cells, config.cells), bool),
-        plane=jnp.stack([below.height, *jnp.zeros(2)]),
-        semantic=below.semantic,
-        friction=below.friction,
-    )
-    return update(config, terrain, nothing, position, yaw)
-
-
-def update(
-    config: SensingConfig,
-    terrain: TerrainMap,
-    observed: ObservedMap,
-    position: jax.Array,
-    yaw: jax.Array,
 ) -> ObservedMap:
     """What is known after looking around at `[3]` p_world, m, and `[]` yaw, rad.
 
-    A cell is seen where its middle is, and stays known. Unknown ground is assumed to lie in the
-    least-squares plane through the ground in view, with class and friction of the ground below the
-    vehicle.
+    terrain: as it was observed before; at the first look, all of it. A cell is seen where its
+    middle is, and stays known. Unknown ground is assumed to lie in the least-squares plane through
+    the ground in view, with class and friction of the ground below the vehicle.
     """
+    observed = terrain.observed
+    if observed is None:
+        below = query.surface(terrain, position[:2])
+        observed = ObservedMap(
+            known=jnp.zeros((config.cells, config.cells), bool),
+            plane=jnp.stack([below.height, *jnp.zeros(2)]),
+            semantic=below.semantic,
+            friction=below.friction,
+        )
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     middles = (np.arange(config.cells, dtype=np.float32) + 0.5) / config.cells
     _, rows, columns = terrain.elevation.shape
