@@ -74,19 +74,15 @@ def terrain(
     x, y, z = frames.origin
     west, south = canvas.origin - [x, y]
     north = south + (known.shape[1] - 1) * canvas.resolution
+    # Rows of a map go from the largest y to the smallest, columns along x.
     built = TerrainMap.from_array(
-        _rows(heights - z),
-        _rows(ground),
+        (heights - z).T[::-1],
+        ground.T[::-1],
         resolution=canvas.resolution,
         origin=(west, north),
         name=name,
     )
     return built, float(1 - known.mean())
-
-
-def _rows(values: np.ndarray) -> np.ndarray:
-    """`[I, J]` by x and y, both rising, to `[J, I]` with the largest y first."""
-    return values.T[::-1]
 
 
 def _patch(name: str, message: Any, layers: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:

@@ -94,10 +94,9 @@ def look(
     )
 
 
-def _places(config: SensingConfig) -> tuple[np.ndarray, np.ndarray]:
-    """m ahead and m to the left `[P]`, evenly over what is in view."""
+def _places(config: SensingConfig) -> np.ndarray:
+    """`[2, P]` m ahead and to the left, evenly over what is in view."""
     rings = config.range * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
     turns = config.field_of_view * ((np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS - 0.5)
     radius, angle = (x.ravel() for x in np.meshgrid(rings, turns))
-    places = radius * np.cos(angle), radius * np.sin(angle)
-    return places[0].astype(np.float32), places[1].astype(np.float32)
+    return (radius * np.stack([np.cos(angle), np.sin(angle)])).astype(np.float32)
