@@ -126,7 +126,8 @@ def main() -> None:
     test = TestWindows.of(
         *dataset.load_drives(chosen.test, "test"), context=16, horizon=16, stride=16
     )
-    errors = prediction.evaluate("recurrent", model, params, test)
+    states = prediction.predict(model, params, test).states
+    errors = prediction.summary("recurrent", states, test)
     weights = sum(x.size for x in jax.tree.leaves(params.network))
     results = {
         f"16-step position error, {kind}": {

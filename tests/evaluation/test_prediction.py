@@ -34,7 +34,8 @@ def straight(windows: int = 5) -> Windows:
 
 def errors_of(model, params, windows, drive=None):
     drive = np.arange(len(windows.world)) if drive is None else drive
-    return prediction.evaluate("it", model, params, TestWindows(windows, drive, GROUND))
+    test = TestWindows(windows, drive, GROUND)
+    return prediction.summary("it", prediction.predict(model, params, test).states, test)
 
 
 def means(errors, measure="position"):

@@ -143,7 +143,8 @@ def test_validation_is_the_error_of_the_tables(data):
     found = jax.jit(problem.validate)(params, data)
     drive = np.arange(len(data.validation.world))
     test = TestWindows(data.validation, drive, data.validation_terrain)
-    table = prediction.evaluate("bicycle", BICYCLE, params, test)
+    states = prediction.predict(BICYCLE, params, test).states
+    table = prediction.summary("bicycle", states, test)
     assert table.count == {"rigid": 10, "deformable": 10, "transition": 10}
     means = {kind: interval.mean for kind, interval in table.final["position"].items()}
     for kind, mean in means.items():

@@ -85,7 +85,7 @@ def test_steps_improve_what_a_plan_returns_smoothly(hilly):
     improve = jax.jit(planner.improve)
     plans = drawn(16)
     for _ in range(2):
-        better = improve(now, memory, plans)
+        better = improve(planner.inside(now, memory), plans)
         assert float(jnp.max(jnp.abs(better))) <= 1.0
         assert (worth(now, better) > worth(now, plans)).all()
         plans = better
@@ -130,7 +130,8 @@ def test_what_it_intends_is_worth_more_than_any_plan_it_drew(blocked):
     noise = jax.random.normal(KEY, (8, 4, 2)).at[0].set(0.0)
     plans = jnp.clip(planner.intended(now, memory) + 0.5 * noise, -1.0, 1.0)
     decided = jax.jit(planner.plan)(now, memory, KEY).corrections
-    worth = jax.jit(planner.worth)(now, memory, jnp.concatenate([plans, decided[None]]))
+    worth = jax.jit(jax.vmap(planner.smooth_return, (None, 0)))
+    worth = worth(planner.inside(now, memory), jnp.concatenate([plans, decided[None]]))
     assert float(worth[-1]) > float(worth[:-1].max()) + 1.0
 
 
@@ -151,7 +152,7 @@ def test_a_gradient_that_is_not_finite_leaves_its_plan_and_no_other():
     planner = driver(env)
     now, memory = started(env, params, planner)
     plans = jnp.array([[[0.2, 0.1]] * 4, [[0.2, -0.1]] * 4])
-    found = jax.jit(planner.improve)(now, memory, plans)
+    found = jax.jit(planner.improve)(planner.inside(now, memory), plans)
     assert not np.allclose(found[0], plans[0]) and np.isfinite(found).all()
     np.testing.assert_array_equal(found[1], plans[1])
 

@@ -171,18 +171,16 @@ class SoilFilter:
 
     def _of_map(self, terrain: TerrainMap) -> Gaussian:
         """What the map says, leaves `[K, 6]` and `[K, 6, 6]`."""
-        numbers = to_unit(query.soils(terrain))
-        mean = logit(jnp.clip(numbers, MARGIN, 1 - MARGIN))
+        mean = logit(jnp.clip(to_unit(query.soils(terrain)), MARGIN, 1 - MARGIN))
         one = self.prior**2 * jnp.eye(mean.shape[1])
         return Gaussian(mean, jnp.broadcast_to(one, (*mean.shape, mean.shape[1])))
 
     def _aged(self, terrain: TerrainMap, soils: Gaussian) -> Gaussian:
         """The belief at the next measurement, by a process that returns to the map."""
         prior, kept = self._of_map(terrain), self.memory
-        return Gaussian(
-            prior.mean + kept * (soils.mean - prior.mean),
-            prior.covariance + kept**2 * (soils.covariance - prior.covariance),
-        )
+        mean = prior.mean + kept * (soils.mean - prior.mean)
+        covariance = prior.covariance + kept**2 * (soils.covariance - prior.covariance)
+        return Gaussian(mean, covariance)
 
 
 def believed(terrain: TerrainMap, belief: SoilBelief) -> TerrainMap:

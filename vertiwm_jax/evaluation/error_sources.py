@@ -33,8 +33,7 @@ def shares(test: TestWindows, error: np.ndarray) -> list[Row]:
         A row for each group, by speed, slope, ground, border and belly contact: its share of all
         windows, %, its mean error, m, and its share of the sum of all errors, %.
     """
-    c = test.windows.context
-    state = np.asarray(test.windows.state)
+    c, state = test.windows.context, np.asarray(test.windows.state)
     tilt = np.degrees(np.abs(state[:, c:, 3:5]).max(axis=2).mean(axis=1))
     kind, distance = _ground(test)
     groups = {

@@ -117,9 +117,8 @@ def trajectories(
             start, end = ("start", "end of a drive") if i == 0 else (None, None)
             overhead.plot(x[-1], y[-1], "s", color=color, markersize=5, label=end)
             overhead.plot(x[0], y[0], "o", **_MARK, markersize=5, label=start)
-            seconds = STEP_SECONDS * np.arange(len(rpy))
             for axes, angle in ((roll, rpy[:, 0]), (pitch, rpy[:, 1])):
-                axes.plot(seconds, np.degrees(angle), dash, color=color)
+                axes.plot(*timed(np.degrees(angle)), dash, color=color)
         draw_goal(overhead, goal, goal_radius)
         roll.set(ylabel="roll [deg], left side up")
         pitch.set(ylabel="pitch [deg], nose down", xlabel="time [s]")

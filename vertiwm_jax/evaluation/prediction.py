@@ -171,11 +171,6 @@ def absolute_errors(
     return dict(zip(MEASURES, map(np.asarray, errors), strict=True)), np.asarray(lost)
 
 
-def evaluate(name: str, dynamics: Dynamics, params: Params, test: TestWindows) -> PredictionErrors:
-    """Errors of a model after the last step of every window, by kind of ground."""
-    return summary(name, predict(dynamics, params, test).states, test)
-
-
 def summary(
     name: str, predicted: VehicleState, test: TestWindows, horizon: int | None = None
 ) -> PredictionErrors:
@@ -225,7 +220,7 @@ def prediction_errors(
         DataError: no drive is long enough.
     """
     test = TestWindows.of(drives, terrain, context, horizon, stride)
-    return evaluate(name, dynamics, params, test)
+    return summary(name, predict(dynamics, params, test).states, test)
 
 
 def format_table(models: Sequence[PredictionErrors], measure: str) -> str:

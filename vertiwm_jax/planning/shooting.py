@@ -12,13 +12,11 @@ from vertiwm_jax.config import Count, CountOrZero, Positive, settings
 from vertiwm_jax.env.agent import Now
 from vertiwm_jax.env.observation import distance_and_bearing
 from vertiwm_jax.env.reward import ending_reward
-from vertiwm_jax.env.task import TaskState
+from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason, edge_distance
-from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.models.registry import Imagined
 from vertiwm_jax.planning.planner import OpenLoopConfig, OpenLoopPlanner, Plan, around
 from vertiwm_jax.terrain import obstacles
-from vertiwm_jax.terrain.map import TerrainMap
 
 
 @settings
@@ -63,21 +61,17 @@ class Shooting(OpenLoopPlanner):
         """The best plan."""
         config = self.config
         drawn = around(self.intended(now, memory), config.candidates, config.spread, key)
-        worth = self.worth(now, memory, drawn)
-        best = drawn[jax.lax.top_k(worth, config.improved)[1]]
-        plans = jnp.concatenate([best, self.improve(now, memory, best)])
-        return replace(memory, corrections=self.chosen(plans, self.worth(now, memory, plans)))
+        inside, worth = self.inside(now, memory), jax.vmap(self.smooth_return, (None, 0))
+        best = drawn[jax.lax.top_k(worth(inside, drawn), config.improved)[1]]
+        plans = jnp.concatenate([best, self.improve(inside, best)])
+        return replace(memory, corrections=self.chosen(plans, worth(inside, plans)))
 
-    def worth(self, now: Now, memory: Plan, plans: jax.Array) -> jax.Array:
-        """`[N]` the `smooth_return` of plans `[N, D, 2]` from where the vehicle is."""
-        return jax.vmap(self.smooth_return, (None, 0))(self.inside(now, memory), plans)
-
-    def improve(self, now: Now, memory: Plan, plans: jax.Array) -> jax.Array:
+    def improve(self, now: Now, plans: jax.Array) -> jax.Array:
         """`[N, D, 2]` plans, each after `steps` of Adam up the gradient of its `smooth_return`.
 
-        Plans stay within [-1, 1], and as they are where a gradient is not finite.
+        Plans stay within [-1, 1], and as they are where a gradient is not finite. `now` is inside
+        the model.
         """
-        now = self.inside(now, memory)
         optimizer = optax.adam(self.config.rate)
         slope = jax.vmap(jax.grad(self.smooth_return, argnums=1), (None, 0))
 
@@ -100,7 +94,6 @@ class Shooting(OpenLoopPlanner):
         """
         env, reward, task = self.env, self.env.config.reward, now.task
         discount = self.config.discount ** (1 / self.config.interval)
-        terrain = task.terrain.select(now.state.world)
 
         def advance(carry: tuple, action: jax.Array) -> tuple[tuple, None]:
             before, weight, total = carry
@@ -110,7 +103,7 @@ class Shooting(OpenLoopPlanner):
             ended = ending_reward(reward, after.ending, distance)
             gain = gain - jnp.where(before.ending == TerminationReason.RUNNING, ended, 0.0)
             remains = jnp.float32(1)
-            for ending, share in self._nearness(terrain, task.vehicle, after, distance).items():
+            for ending, share in self._nearness(task, after, distance).items():
                 gain = gain + share * ending_reward(reward, jnp.int32(ending), distance)
                 remains = remains * (1 - share)
             return (after, weight * discount * remains, total + weight * gain), None
@@ -121,10 +114,11 @@ class Shooting(OpenLoopPlanner):
         return total + weight * self.expected(replace(now, state=end))
 
     def _nearness(
-        self, terrain: TerrainMap, vehicle: Vehicle, state: TaskState, distance: jax.Array
+        self, task: TaskParams, state: TaskState, distance: jax.Array
     ) -> dict[TerminationReason, jax.Array]:
         """`[]` from 0 to 1 for endings at a distance or an angle, 1/2 where the task draws them."""
         config, position = self.env.config, state.vehicle.position[:2]
+        terrain, vehicle = task.terrain.select(state.world), task.vehicle
         roll, pitch, yaw = state.vehicle.rpy
         tilt = jnp.maximum(jnp.abs(roll), jnp.abs(pitch))
         gap = obstacles.gap(terrain, position, yaw, vehicle.length, vehicle.width)
