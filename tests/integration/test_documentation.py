@@ -2,13 +2,14 @@
 
 import importlib
 import importlib.util
+import inspect
 import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 
 import pytest
@@ -165,8 +166,10 @@ def reading(tmp_path, monkeypatch):
     """Commands end once their arguments are read, in a folder that has what these name."""
     read = tyro.cli
 
-    def only_read(*args, **kwargs):
-        raise Understood(read(*args, **kwargs))
+    def only_read(kind, **kwargs):
+        if inspect.isfunction(kind):  # It would be called with what is read.
+            kind = wraps(kind)(lambda *args, **settings: (args, settings))
+        raise Understood(read(kind, **kwargs))
 
     monkeypatch.setattr(tyro, "cli", only_read)
     monkeypatch.chdir(tmp_path)
