@@ -45,8 +45,7 @@ def reward(
     progress: jax.Array,
     distance: jax.Array,
     stalled: jax.Array,
-    roll: jax.Array,
-    pitch: jax.Array,
+    tilt: jax.Array,
     vertical_speed: jax.Array,
     disagreement: jax.Array,
     spread: jax.Array,
@@ -54,19 +53,16 @@ def reward(
 ) -> jax.Array:
     """`[...]` reward of one 0.1 s step.
 
-    progress: m by which the cost to go fell; distance: m left; stalled: bool; roll, pitch: rad;
-    vertical_speed: m/s in the world frame; disagreement, spread: m; ending: `TerminationReason`
-    codes.
+    progress: m by which the cost to go fell; distance: m left; stalled: bool; tilt: `[..., 2]` roll
+    and pitch, rad; vertical_speed: m/s in the world frame; disagreement, spread: m; ending:
+    `TerminationReason` codes.
     """
-
-    def tilt_penalty(angle: jax.Array) -> jax.Array:
-        size = jnp.abs(angle)
-        return size / config.tilt_limit * jnp.maximum(size - config.tilt_limit, 0.0)
-
+    size = jnp.abs(tilt)
+    beyond = size / config.tilt_limit * jnp.maximum(size - config.tilt_limit, 0.0)
     return (
         config.progress * progress
         - config.stalled * stalled
-        - config.tilt * (tilt_penalty(roll) + tilt_penalty(pitch))
+        - config.tilt * jnp.sum(beyond, axis=-1)
         - config.vertical * jnp.abs(vertical_speed)
         - config.disagreement * disagreement
         - config.spread * spread

@@ -19,6 +19,7 @@ from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 
 DYNAMICS = Simulator()
+_Moving = tuple[VehicleState, SimulatorHistory]
 
 
 class BuiltIn:
@@ -41,28 +42,22 @@ class BuiltIn:
     def step(self, command: np.ndarray) -> Observation:
         """As `Simulator.step`."""
         command = np.asarray(command, np.float32)
-        *self._moving, seen = _step(self._params, self._terrain, *self._moving, command)
+        self._moving, seen = _step(self._params, self._terrain, self._moving, command)
         return jax.device_get(seen)
 
 
 @jax.jit
-def _place(
-    params: SimulatorParams, terrain: TerrainMap, pose: jax.Array
-) -> tuple[VehicleState, SimulatorHistory]:
+def _place(params: SimulatorParams, terrain: TerrainMap, pose: jax.Array) -> _Moving:
     state = place(terrain, pose[:2], pose[2], vehicle=params.vehicle)
     return state, DYNAMICS.init(params, terrain, state)
 
 
 @jax.jit
 def _step(
-    params: SimulatorParams,
-    terrain: TerrainMap,
-    state: VehicleState,
-    history: SimulatorHistory,
-    command: jax.Array,
-) -> tuple[VehicleState, SimulatorHistory, Observation]:
+    params: SimulatorParams, terrain: TerrainMap, moving: _Moving, command: jax.Array
+) -> tuple[_Moving, Observation]:
     state, history, forces = DYNAMICS.step_with_forces(
-        params, terrain, history, state, Command.from_vector(command)
+        params, terrain, moving[1], moving[0], Command.from_vector(command)
     )
     vehicle, rotation = params.vehicle, geometry.rotation_from_rpy(state.rpy).as_matrix()
     in_body = jnp.concatenate([vehicle.wheel_position, history.travel[:, None]], axis=-1)
@@ -76,4 +71,4 @@ def _step(
         chassis_force=jnp.mean(forces.hull, axis=0),
         steer_angle=jnp.full(2, history.steering),
     )
-    return state, history, Observation(state.vector, wheel_class, wheels)
+    return (state, history), Observation(state.vector, wheel_class, wheels)
