@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeVar
 import jax
 import jax.numpy as jnp
 
+from vertiwm_jax.precision import float32
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -49,6 +50,7 @@ def step(dynamics: Dynamics, *given: Any) -> tuple[VehicleState, History]:
     return dynamics.step(*given)
 
 
+@float32
 def disagreement(history: History) -> jax.Array:
     """`[]` m between where the models went that the last step was made of; 0 of a single one.
 
@@ -57,6 +59,7 @@ def disagreement(history: History) -> jax.Array:
     return getattr(history, "disagreement", jnp.float32(0))
 
 
+@float32
 def spread(history: History) -> jax.Array:
     """`[]` m, the standard deviation of where each of an ensemble went; 0 of a single model.
 
@@ -74,6 +77,7 @@ def embedding(history: History) -> jax.Array | None:
     return features[0].latents if features else None
 
 
+@float32
 def warm_up(
     dynamics: Dynamics,
     params: Params,
@@ -94,6 +98,7 @@ def warm_up(
     return replace(history, features=see(params, terrain, last)) if see else history
 
 
+@float32
 def along(
     dynamics: Dynamics,
     params: Params,
@@ -138,6 +143,7 @@ def _steps(
     return jax.lax.scan(advance, seeing(begun, None), (states, commands))
 
 
+@float32
 def rollout(
     dynamics: Dynamics,
     params: Params,

@@ -1,6 +1,6 @@
 """CASE...: which kinds of floating-point numbers each case is computed in, as JSON.
 
-For a process with JAX_ENABLE_X64 set. What cannot be traced is told by its error.
+For a process with JAX_ENABLE_X64 or JAX_DEBUG_NANS set. What cannot be traced is told by its error.
 """
 
 import json
@@ -17,8 +17,10 @@ from env.worlds import GRASS, bicycle_env, ground
 import vertiwm_jax.gym  # Registers the task.
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, rollout
-from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.controllers import LookAhead
+from vertiwm_jax.env.navigation import NavigationEnv, make_env
 from vertiwm_jax.env.suites import circle_tasks
+from vertiwm_jax.evaluation.navigation import evaluate
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of, place
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import load_vehicle
@@ -45,25 +47,36 @@ def drive(model: Dynamics, params: Any) -> VehicleState:
     )
 
 
-def learn(algorithm: Callable[[NavigationEnv], Any]) -> Any:
-    """An iteration of a training in the bicycle."""
+def learn(algorithm: Callable[[NavigationEnv], Any], call: Any = jax.eval_shape) -> Any:
+    """An iteration of a training in the bicycle, which is traced or run."""
     terrain = ground()
     env, params = bicycle_env(terrain, circle_tasks(terrain, pairs=1))
     made = algorithm(env)
-    state = jax.eval_shape(made.init, params, jax.random.key(0))
-    return jax.eval_shape(made.iterate, params, state)
+    state = call(made.init, params, jax.random.key(0))
+    return call(made.iterate, params, state)
 
 
+def ppo(env: NavigationEnv) -> PPO:
+    return PPO(env, PPOConfig(**COLLECTED, minibatches=2, epochs=1))
+
+
+def driven() -> Any:
+    """Whole episodes, compiled and run."""
+    env, _ = make_env(ground(), "bicycle", pairs=1)
+    return evaluate(LookAhead(env.config), ground(), model="bicycle", pairs=1)
+
+
+RUN = {"driven": driven, "learned": lambda: learn(ppo, lambda function, *given: function(*given))}
 CASES = {
     "worlds": lambda: worlds.generate(jax.random.split(jax.random.key(0), 1), worlds.WorldConfig()),
     "bicycle": lambda: drive(KinematicBicycle(), bicycle_of(load_vehicle())),
     "simulator": lambda: drive(Simulator(), chrono_like(load_vehicle())),
     "shipped weights": lambda: drive(*load_model("vertiwm")),
     "gymnax": lambda: gymnax.make(vertiwm_jax.gym.GYMNAX_NAME, terrain=ground(), pairs=1)[1],
-    "ppo": lambda: learn(lambda env: PPO(env, PPOConfig(**COLLECTED, minibatches=2, epochs=1))),
+    "ppo": lambda: learn(ppo),
     "sac": lambda: learn(lambda env: SAC(env, SACConfig(**REPLAYED))),
     "td3": lambda: learn(lambda env: TD3(env, TD3Config(**REPLAYED))),
-}
+} | RUN
 
 
 def computed_in(case: Callable[[], Any]) -> list[str]:

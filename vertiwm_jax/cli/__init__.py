@@ -58,6 +58,7 @@ def prepare(name: str) -> None:
     machine.use_cores()
     # Tracing makes many lasting objects; looking for garbage among them is a sixth of its time.
     gc.set_threshold(100_000, 50, 50)
+    jax.config.update("jax_enable_x64", False)
     hosts.join(name)
 
 

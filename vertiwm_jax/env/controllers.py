@@ -10,6 +10,7 @@ from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, GOAL, ROUTE_
 from vertiwm_jax.env.route import TraversabilityCost
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
+from vertiwm_jax.precision import float32
 
 REFERENCE = "straight to goal"
 """The controller whose failures define which tasks are hard."""
@@ -39,6 +40,7 @@ class StraightToGoal:
     speed: float = 4.0
     gain: float = 1.0
 
+    @float32
     def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """`[..., O]` observation to `[..., 2]` action; the key is not used."""
         _, cos, sin = jnp.moveaxis(observation[..., GOAL], -1, 0)
@@ -65,6 +67,7 @@ class LookAhead:
     far: tuple[int, int] = struct.field(pytree_node=False, default=(5, 7))
     spread: float = struct.field(pytree_node=False, default=0.4)
 
+    @float32
     def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """`[..., O]` observation to `[..., 2]` action; the key is not used."""
         _, crown, rise, bank, twist, route = arcs_ahead(observation)
@@ -79,6 +82,7 @@ class LookAhead:
 class RandomActions:
     """Draws a new action at every step, uniform in [-1, 1]^2."""
 
+    @float32
     def __call__(self, observation: jax.Array, key: jax.Array) -> jax.Array:
         """`[..., O]` observation to `[..., 2]` action."""
         return jax.random.uniform(key, (*observation.shape[:-1], 2), minval=-1.0, maxval=1.0)

@@ -24,6 +24,7 @@ from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, load_vehicle
 from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.perception.perceive import embed
+from vertiwm_jax.precision import float32
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import obstacles, patches, query, sensing
 from vertiwm_jax.terrain.files import load_map
@@ -52,6 +53,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
     action_repeat: int = 1
     base: Policy | None = None
 
+    @float32
     def make_params(
         self,
         dynamics: Params,
@@ -127,6 +129,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         """Observation and state of start `[]` of the pool."""
         return jax.tree.map(lambda x: x[index], (params.start_observation, params.starts))
 
+    @float32
     def reset_env(self, key: jax.Array, params: TaskParams) -> tuple[jax.Array, TaskState]:
         """A start drawn evenly from the pool, and how the episode varies."""
         seen, state = self.start(params, jax.random.randint(key, (), 0, params.pool_size))
@@ -135,6 +138,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         )
         return seen, dataclasses.replace(state, variation=variation)
 
+    @float32
     def step_env(
         self, key: jax.Array, state: TaskState, action: int | float | jax.Array, params: TaskParams
     ) -> tuple[jax.Array, TaskState, jax.Array, jax.Array, dict[Any, Any]]:
@@ -244,6 +248,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         }
         return self.observe(None, new, action, params), new, gain, is_terminal(ending), info
 
+    @float32
     def observe(
         self,
         key: jax.Array | None,
@@ -350,6 +355,7 @@ def _settle(
 _settle_once = xla.brief_jit(_settle, static_argnames="env")
 
 
+@float32
 def make_env(
     terrain: TerrainMap | str | Path | None = None,
     model: Imagined = "builtin",

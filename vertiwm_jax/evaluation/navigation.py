@@ -15,10 +15,12 @@ from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation.tables import markdown
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle
 from vertiwm_jax.models.registry import Imagined
+from vertiwm_jax.precision import float32
 from vertiwm_jax.rl.policy import Policy as Trained
 from vertiwm_jax.terrain.map import TerrainMap
 
 
+@float32
 def evaluate(
     agent: Agent | Policy | Trained,
     terrain: TerrainMap | None = None,

@@ -18,6 +18,7 @@ from vertiwm_jax.learning.dataset import Drives, WheelSignals
 from vertiwm_jax.learning.objectives import open_loop
 from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.mechanics.simulator import SimulatorHistory
+from vertiwm_jax.precision import float32
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -191,6 +192,7 @@ def summary(
     return PredictionErrors(name, horizon, final, growth, count, int(lost.sum()))
 
 
+@float32
 def prediction_errors(
     dynamics: Dynamics,
     params: Params,

@@ -15,6 +15,7 @@ from flax import struct
 from vertiwm_jax import geometry
 from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.precision import float32
 from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain.map import TerrainMap, stack
 
@@ -64,6 +65,7 @@ class Drives:
     wheels: WheelSignals
 
 
+@float32
 def load_drives(
     folders: str | Path | Sequence[str | Path], split: Split = "train"
 ) -> tuple[Drives, TerrainMap]:

@@ -15,6 +15,7 @@ from vertiwm_jax.learning import pipeline
 from vertiwm_jax.learning.pipeline import PipelineConfig
 from vertiwm_jax.models import files
 from vertiwm_jax.models.registry import load_fitted
+from vertiwm_jax.precision import float32
 from vertiwm_jax.runs import Run
 from vertiwm_jax.training import keep_compiled
 from vertiwm_jax.world_model.verti_wm import VertiWMParams
@@ -66,6 +67,7 @@ def run(config: FitConfig) -> Path:
     return run.folder
 
 
+@float32
 def fit(
     drives: str | Path | Sequence[str | Path],
     *,

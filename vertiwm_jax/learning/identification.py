@@ -22,6 +22,7 @@ from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics import vehicle as vehicles
 from vertiwm_jax.mechanics.simulator import Simulator, SimulatorParams, chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
+from vertiwm_jax.precision import float32
 from vertiwm_jax.terrain.map import TerrainMap
 
 FREE = ("speed_gain", "wheel_torque", "brake_torque", "tyre_friction")
@@ -32,6 +33,7 @@ _STEP = 0.02  # share by which numbers are changed to see what they do
 _log = logging.getLogger(__name__)
 
 
+@float32
 def identify(
     drives: str | Path | Sequence[str | Path],
     vehicle: str | VehicleConfig = HMMWV,

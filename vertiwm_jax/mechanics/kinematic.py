@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from vertiwm_jax import geometry
 from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
+from vertiwm_jax.precision import float32
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -21,9 +22,11 @@ SPEED_LAG = 0.2
 class ConstantVelocity:
     """Keeps the body twist: T' = T Exp(nu dt). Ignores command, ground and parameters."""
 
+    @float32
     def init(self, params: None, terrain: TerrainMap, state: VehicleState) -> tuple[()]:
         return ()
 
+    @float32
     def step(
         self,
         params: None,
@@ -47,6 +50,7 @@ class BicycleParams:
     speed_lag: jax.Array
 
 
+@float32
 def bicycle_of(vehicle: Vehicle) -> BicycleParams:
     """The bicycle with the axles of `vehicle` that rides as its springs carry it."""
     numbers = vehicle.wheelbase, vehicle.track, vehicle.ride_height, SPEED_LAG
@@ -61,9 +65,11 @@ class KinematicBicycle:
     Height, roll and pitch are those of the plane through the ground at the four wheels.
     """
 
+    @float32
     def init(self, params: BicycleParams, terrain: TerrainMap, state: VehicleState) -> tuple[()]:
         return ()
 
+    @float32
     def step(
         self,
         params: BicycleParams,
@@ -90,6 +96,7 @@ class KinematicBicycle:
         return replace(there, velocity=velocity, angular_velocity=angular_velocity), ()
 
 
+@float32
 def place(
     terrain: TerrainMap,
     xy: ArrayLike | None = None,

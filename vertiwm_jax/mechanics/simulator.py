@@ -30,6 +30,7 @@ from vertiwm_jax.mechanics.scm import ScmParams
 from vertiwm_jax.mechanics.suspension import ADHESION_SPEED, hull_contact, support, suspend
 from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle
 from vertiwm_jax.mechanics.wheel import SoilContact
+from vertiwm_jax.precision import float32
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.soil import Soil
@@ -51,6 +52,7 @@ class SimulatorParams:
     stiffening: jax.Array
 
 
+@float32
 def chrono_like(vehicle: Vehicle) -> SimulatorParams:
     """Chrono's soil contact model, fitted to the training drives of an HMMWV.
 
@@ -110,6 +112,7 @@ class Simulator:
     substeps: int = 5
     """Steps of the integrator in 0.1 s."""
 
+    @float32
     def init(
         self, params: SimulatorParams, terrain: TerrainMap, state: VehicleState
     ) -> SimulatorHistory:
@@ -128,6 +131,7 @@ class Simulator:
             force=jnp.zeros((4, 3)).at[:, 0].set(load),
         )
 
+    @float32
     def step(
         self,
         params: SimulatorParams,

@@ -12,6 +12,7 @@ from flax import struct
 from vertiwm_jax import config as configuration
 from vertiwm_jax import froude
 from vertiwm_jax.config import Positive, settings
+from vertiwm_jax.precision import float32
 from vertiwm_jax.state import Command
 
 GRAVITY = 9.81
@@ -205,6 +206,7 @@ def load(name: str) -> VehicleConfig:
     return configuration.load(VehicleConfig, path)
 
 
+@float32
 def load_vehicle(name: str = HMMWV) -> Vehicle:
     """Loads a vehicle.
 

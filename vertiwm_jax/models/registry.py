@@ -13,6 +13,7 @@ from vertiwm_jax.models import files
 from vertiwm_jax.models.config import SoilSource, with_soil
 from vertiwm_jax.networks.specialist import ComputeDtype, cast_weights
 from vertiwm_jax.perception.features import Encoders
+from vertiwm_jax.precision import float32
 from vertiwm_jax.world_model.alone import Alone
 from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
@@ -22,6 +23,7 @@ Imagined = Literal["bicycle", "builtin", "transformer", "nesam", "vertiwm"]
 """What a planner may imagine in: those, and a kinematic bicycle, which knows no forces."""
 
 
+@float32
 def load_model(
     name: Imagined = "vertiwm",
     weights: str | Path | None = None,

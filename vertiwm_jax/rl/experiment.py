@@ -25,6 +25,7 @@ from vertiwm_jax.models.registry import Imagined, ModelName, load_encoders, load
 from vertiwm_jax.networks.specialist import ComputeDtype
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.planning.improvement import ImprovementConfig, PolicyImprovement
+from vertiwm_jax.precision import float32
 from vertiwm_jax.rl import policy
 from vertiwm_jax.rl.algorithm import LearningConfig, PolicyAlgorithm
 from vertiwm_jax.rl.policy import Base, PolicyConfig, load_policy
@@ -360,6 +361,7 @@ def run(config: TrainConfig, worlds: TerrainMap | None = None) -> Trained:
     return Trained(config, begun.folder, held_out, None if worlds else config.world_suites)
 
 
+@float32
 def train(
     config: str | Path = "ppo",
     terrain: TerrainMap | str | Path | None = None,

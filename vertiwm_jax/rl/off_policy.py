@@ -18,6 +18,7 @@ from flax import struct
 from vertiwm_jax import parallel
 from vertiwm_jax.config import ConfigError, Count, NotNegative, Positive, Share, settings
 from vertiwm_jax.networks.policy import ActionCritic, TanhNormal, TanhNormalActor, twin_values
+from vertiwm_jax.precision import float32
 from vertiwm_jax.rl.algorithm import LearningConfig, LearningState, Metrics, PolicyAlgorithm, Steps
 from vertiwm_jax.rl.replay import Replay
 from vertiwm_jax.training import all_finite
@@ -144,6 +145,7 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState]):
     def learn(self, learner: Learner, batch: Remembered, key: jax.Array) -> tuple[Learner, Metrics]:
         """A gradient step on a normalized batch; the metrics are scalars, NaN for none."""
 
+    @float32
     def init(self, data: Params, key: jax.Array) -> OffPolicyState:
         """The state before the first iteration."""
         key, reset_key, learner_key = jax.random.split(key, 3)
@@ -157,6 +159,7 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState]):
             replay=Replay.create(row, self.config.buffer_size),
         )
 
+    @float32
     def iterate(self, data: Params, state: OffPolicyState) -> tuple[OffPolicyState, Metrics]:
         """`num_steps` steps of all environments, each with its gradient steps; jit it, donated.
 

@@ -29,6 +29,7 @@ from vertiwm_jax.networks.policy import (
     TanhNormalActor,
     twin_values,
 )
+from vertiwm_jax.precision import float32
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 
 FOLDER = "policy"
@@ -156,10 +157,12 @@ class Policy:
         config = replace(self.config, vehicle=vehicle)
         return replace(self, config=config, base=config.controller)
 
+    @float32
     def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """`[..., O]` observations to `[..., 2]` actions in [-1, 1]; no key is needed."""
         return self.acting(observation, key)
 
+    @float32
     def value(self, observation: jax.Array) -> jax.Array:
         """`[..., O]` observations to `[...]` returns that it expects, in units of reward."""
         return self.worth(observation)
@@ -180,6 +183,7 @@ def save(folder: Path, config: PolicyConfig, value: Value) -> None:
     atomic.write(folder / "weights.npz", stream.getvalue())
 
 
+@float32
 def load_policy(folder: str | Path, seed: int = 0) -> Policy:
     """Loads a trained policy.
 

@@ -20,6 +20,7 @@ from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, NotNegative, Positive, Share, settings
 from vertiwm_jax.networks.policy import Actor, Critic, Gaussian
 from vertiwm_jax.parallel import BATCH, ROWS, WHOLE
+from vertiwm_jax.precision import float32
 from vertiwm_jax.rl.algorithm import LearningConfig, LearningState, Metrics, PolicyAlgorithm, Steps
 from vertiwm_jax.rl.gae import gae
 from vertiwm_jax.training import all_finite, mean_in_turns
@@ -127,6 +128,7 @@ class PPO(PolicyAlgorithm[TrainState]):
     def weights(self, state: TrainState) -> tuple[Params, Params]:
         return state.params["actor"], state.params["critic"]
 
+    @float32
     def init(self, data: Params, key: jax.Array) -> TrainState:
         """The state before the first iteration."""
         key, reset_key, actor_key, critic_key = jax.random.split(key, 4)
@@ -138,6 +140,7 @@ class PPO(PolicyAlgorithm[TrainState]):
         }
         return TrainState(**begun, params=params, optimizer=self._optimizer.init(params))
 
+    @float32
     def iterate(self, data: Params, state: TrainState) -> tuple[TrainState, Metrics]:
         """Collects `[T, N]` steps and learns from them; jit it with `state` donated.
 

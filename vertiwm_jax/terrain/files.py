@@ -13,6 +13,7 @@ from PIL import Image
 
 from vertiwm_jax import atomic, froude
 from vertiwm_jax.errors import needs, refusing
+from vertiwm_jax.precision import float32
 from vertiwm_jax.terrain import query, soil, vertibench
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.map import MapError, TerrainMap, stack
@@ -31,6 +32,7 @@ _SOIL_FIELDS = {
 _NO_DATA = 42113  # GDAL's tag of the value that stands for none
 
 
+@float32
 def load_map(path: str | Path, *, scale: float = 1.0, obstacles: bool = True) -> TerrainMap:
     """Loads a map, or all maps of a folder.
 

@@ -12,6 +12,7 @@ from flax import struct
 from numpy.typing import ArrayLike
 
 from vertiwm_jax.errors import UserError
+from vertiwm_jax.precision import float32
 from vertiwm_jax.terrain import soil
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.soil import Soil
@@ -113,6 +114,7 @@ class TerrainMap:
         return self.origin - up, self.origin + along
 
     @staticmethod
+    @float32
     def from_array(
         elevation: ArrayLike,
         classes: ArrayLike | str = "grass",

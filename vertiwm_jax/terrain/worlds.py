@@ -15,6 +15,7 @@ import numpy as np
 
 from vertiwm_jax import froude, xla
 from vertiwm_jax.config import AtLeastOne, Bounds, CountOrZero, Share, settings
+from vertiwm_jax.precision import float32
 from vertiwm_jax.terrain.classes import FIRST_DEFORMABLE, STANDARD
 from vertiwm_jax.terrain.map import BY_WORLD, TerrainMap
 
@@ -82,6 +83,7 @@ def labels(config: WorldConfig, count: int) -> list[tuple[Difficulty | float, Ki
     return [(difficulty, kind) for kind, difficulty in islice(cycle(pairs), count)]
 
 
+@float32
 def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> TerrainMap:
     """Draws one world for each of the typed keys `[W]`, on the device; deterministic.
 
@@ -108,6 +110,7 @@ def generate(keys: jax.Array, config: WorldConfig, scale: float = 1.0) -> Terrai
     return replace(level, **drawn, soils=jax.tree.map(lambda leaf: leaf[None], soils))
 
 
+@float32
 def make_worlds(
     number: int = 1, seed: int = 0, config: WorldConfig = WorldConfig(), *, scale: float = 1.0
 ) -> TerrainMap:

@@ -8,6 +8,7 @@ from flax import struct
 from vertiwm_jax.dynamics import History
 from vertiwm_jax.perception.features import Encoders, TerrainFeatures
 from vertiwm_jax.perception.perceive import perceive, reduced
+from vertiwm_jax.precision import float32
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model.nesam import Nesam
@@ -37,11 +38,13 @@ class Alone:
     specialist: Transformer | Nesam
     latents: bool = False
 
+    @float32
     def init(self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState) -> AloneHistory:
         """The specialist's history, and a look at the ground."""
         begun = self.specialist.init(self._own(params), params.vehicle, terrain, state)
         return AloneHistory(self.see(params, terrain, state), begun)
 
+    @float32
     def see(
         self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState
     ) -> tuple[TerrainFeatures, ...]:
@@ -49,6 +52,7 @@ class Alone:
         encoders = self._encoders(params.encoders)
         return perceive(encoders, terrain, state, self.latents) if encoders else ()
 
+    @float32
     def step(
         self,
         params: VertiWMParams,

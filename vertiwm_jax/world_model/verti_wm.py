@@ -11,6 +11,7 @@ from vertiwm_jax.networks.gate import HIDDEN
 from vertiwm_jax.networks.transformer import KeyValueCache
 from vertiwm_jax.perception.features import Encoders, TerrainFeatures
 from vertiwm_jax.perception.perceive import perceive, reduced
+from vertiwm_jax.precision import float32
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import fusion, motion
@@ -99,6 +100,7 @@ class VertiWM:
     coefficients: Coefficients = "grouped"
     latents: bool = False
 
+    @float32
     def init(
         self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState
     ) -> VertiWMHistory:
@@ -114,12 +116,14 @@ class VertiWM:
             alphas=jnp.full((gates, 4), 0.5, jnp.float32),
         )
 
+    @float32
     def see(
         self, params: VertiWMParams, terrain: TerrainMap, state: VehicleState
     ) -> tuple[TerrainFeatures, ...]:
         """What each pair of encoders makes of the ground at a state (Eq. 1)."""
         return perceive(params.encoders, terrain, state, self.latents)
 
+    @float32
     def step(
         self,
         params: VertiWMParams,
