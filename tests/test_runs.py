@@ -62,7 +62,7 @@ def test_resuming_drops_what_followed_the_checkpoint(tmp_path):
     with Run.create(tmp_path, "ppo", Settings()) as run:
         for step in range(5):
             run.log(step, {"return": float(step)})
-    with Run.open(run.folder, 2, Settings(8)) as again:
+    with Run(run.folder, Settings(8), 2) as again:
         assert config.load(Settings, run.folder / "config.yaml") == Settings(8)
         assert steps(run.folder) == [0, 1, 2]
         again.log(3, {"return": 30.0})
@@ -91,7 +91,7 @@ def test_a_torn_last_line_is_dropped(tmp_path):
     whole = path.read_bytes()
     path.write_bytes(whole + b'{"step": 2, "retu')
     assert steps(run.folder) == [1]
-    Run.open(run.folder, 9, Settings()).close()
+    Run(run.folder, Settings(), 9).close()
     assert path.read_bytes() == whole
 
 
@@ -104,7 +104,7 @@ def test_a_damaged_line_is_named(tmp_path, line):
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(RunError, match=r"metrics\.jsonl: cannot read"):
-        Run.open(tmp_path, 0, Settings())
+        Run(tmp_path, Settings(), 0)
     (tmp_path / "file").touch()
     with pytest.raises(RunError, match="file: cannot start a run there"):
         Run.create(tmp_path / "file", "ppo", Settings())

@@ -78,7 +78,7 @@ def test_the_first_interrupt_ends_the_iteration_and_saves(new_run, monkeypatch, 
         with pytest.raises(TrainingInterrupted, match=r"iteration 6 of 10, all saved; .*--resume"):
             go(run, 10)
     assert signal.getsignal(number) is before
-    chex.assert_trees_all_equal(go(Run.open(run.folder, 6, CONFIG), 10), Counter(jnp.float32(11)))
+    chex.assert_trees_all_equal(go(Run(run.folder, CONFIG, 6), 10), Counter(jnp.float32(11)))
     assert [line["step"] for line in runs.read_metrics(run.folder)] == list(range(1, 11))
 
 

@@ -74,9 +74,7 @@ def load(path: str | Path, like: State) -> State:
     A checkpoint with other leaves, shapes or types raises `CheckpointError` that names the first.
     """
     path = Path(path).absolute()
-    leaves = named_leaves(like)
-    shapes = jax.eval_shape(hosts.without_keys, leaves)
-    stored = {name: shapes[name] for name in leaves}  # in their order
+    stored = named_leaves(jax.eval_shape(hosts.without_keys, like))
     try:
         with _quiet(), _alone():
             found = ocp.metadata(str(path)).metadata
@@ -86,8 +84,8 @@ def load(path: str | Path, like: State) -> State:
     except (OSError, ValueError, KeyError) as error:
         reason = str(error).splitlines()[0]
         raise CheckpointError(f"{path}: not a readable checkpoint: {reason}") from error
-    restored = hosts.with_keys(leaves, restored)
-    return jax.tree.unflatten(jax.tree.structure(like), [restored[name] for name in leaves])
+    leaves = [restored[name] for name in stored]
+    return hosts.with_keys(like, jax.tree.unflatten(jax.tree.structure(like), leaves))
 
 
 def names(path: str | Path) -> set[str]:

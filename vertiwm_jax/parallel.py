@@ -102,12 +102,12 @@ def place(mesh: Mesh, tree: T, specs: Any = WHOLE) -> T:
 
 def shardings(mesh: Mesh, specs: Any = WHOLE) -> Any:
     """The places of leaves on a mesh."""
-    return jax.tree.map(partial(NamedSharding, mesh), specs, is_leaf=_is_spec)
+    return jax.tree.map(partial(NamedSharding, mesh), specs)
 
 
 def with_axis(name: str, specs: Any) -> Any:
     """How leaves are shared out that have one more axis, the first, which devices share too."""
-    return jax.tree.map(lambda spec: PartitionSpec(name, *spec), specs, is_leaf=_is_spec)
+    return jax.tree.map(lambda spec: PartitionSpec(name, *spec), specs)
 
 
 def gather(mesh: Mesh, tree: T) -> T:
@@ -144,7 +144,7 @@ def shard(function: Callable[..., T], in_specs: Sequence[Any], out_specs: Any) -
 
                 return jax.tree.map(leaf, given, whole, is_leaf=lambda x: x is None)
 
-            return function(*jax.tree.map(with_empty, in_specs, given, args, is_leaf=_is_spec))
+            return function(*jax.tree.map(with_empty, in_specs, given, args))
 
         spread = jax.shard_map(on_device, in_specs=in_specs, out_specs=out_specs, check_vma=False)
         return spread(*filled)
@@ -239,7 +239,3 @@ def placed(tree: T, spec: PartitionSpec) -> T:
 def _mesh(devices: np.ndarray) -> Mesh:
     """Of devices `[seeds, batch]`."""
     return Mesh(devices, (SEEDS, BATCH), axis_types=(AxisType.Auto, AxisType.Auto))
-
-
-def _is_spec(leaf: Any) -> bool:
-    return isinstance(leaf, PartitionSpec)

@@ -39,42 +39,49 @@ def _refused(action: str) -> Iterator[None]:
 class Run:
     """One run's folder: `config.yaml`, `metrics.jsonl`, TensorBoard events, and what commands add.
 
-    Made by `Run.create` and continued by `Run.open`. `outermost` is the folder to resume: that of
-    the run that this one is a `part` of, or its own.
+    `outermost` is the folder to resume: that of the run that this one is a `part` of, or its own.
     """
 
-    def __init__(self, folder: Path, events: Events) -> None:
-        self.folder = folder
-        self.outermost = folder
-        self._events = events
-        self._project: str | None = None
+    def __init__(
+        self,
+        folder: Path,
+        settings: Any,
+        step: int | None = None,
+        project: str | None = None,
+        outermost: Path | None = None,
+    ) -> None:
+        """Begins a run, or goes on with the one in `folder` from its checkpoint at `step`.
+
+        Then later metrics are dropped, and the dataclass `settings` replaces the earlier ones.
+        A folder that cannot be made or written, or whose metrics are missing or damaged, raises
+        `RunError`. project: of Weights & Biases, which gets the metrics of the first host too;
+        `TrackingError` where it refuses.
+        """
+        self.folder, self.outermost, self.project = folder, outermost or folder, project
+        known = [] if step is None else read_metrics(folder)
+        kept = [json.dumps(entry) + "\n" for entry in known if entry["step"] <= (step or 0)]
+        with _refused(f"{folder}: cannot keep a run there"):
+            folder.mkdir(exist_ok=True)
+            atomic.write(folder / METRICS, "".join(kept))
+            atomic.write(folder / "config.yaml", config.dump(settings))
+            self._events = Events(folder)
+            if step is not None:
+                self._events.restart(step + 1)
         self._tracker: Any = None
+        if project and hosts.is_first():
+            self._tracker = trackers.begin(project, folder, self.outermost, settings)
 
     @classmethod
-    def create(cls, root: str | Path, name: str, settings: Any) -> Self:
-        """Make `root/name-YYYYmmdd-HHMMSS/` and write the dataclass `settings` into it.
-
-        A folder that cannot be made or written raises `RunError`.
-        """
-        stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    def create(cls, root: str | Path, name: str, settings: Any, project: str | None = None) -> Self:
+        """Begins a run in a new folder `root/name-YYYYmmdd-HHMMSS`; raises as `Run`."""
+        first = Path(root) / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+        folder, number = first, 1
         with _refused(f"{root}: cannot start a run there"):
-            return cls._begin(_make_folder(Path(root), f"{name}-{stamp}"), settings)
-
-    @classmethod
-    def open(cls, folder: str | Path, step: int, settings: Any) -> Self:
-        """Continue a run from its checkpoint at `step` with the dataclass `settings`.
-
-        Later metrics are dropped and `config.yaml` is replaced. A folder without metrics, or with
-        damaged ones, raises `RunError`.
-        """
-        folder = Path(folder)
-        kept = [entry for entry in read_metrics(folder) if entry["step"] <= step]
-        atomic.write(folder / METRICS, "".join(json.dumps(entry) + "\n" for entry in kept))
-        atomic.write(folder / "config.yaml", config.dump(settings))
-        with _refused(f"{folder}: cannot continue the run"):
-            events = Events(folder)
-            events.restart(step + 1)
-        return cls(folder, events)
+            while folder.exists():
+                number += 1
+                folder = Path(f"{first}-{number}")
+            folder.mkdir(parents=True)
+        return cls(folder, settings, project=project)
 
     @classmethod
     def begin(cls, settings: Any, name: str, step: int = 0, project: str | None = None) -> Self:
@@ -82,42 +89,21 @@ class Run:
 
         Of several hosts only the first keeps a folder; the others have temporary ones.
         settings: a dataclass with `runs`, the folder of runs, and `resume`, that of the run to
-        continue, or None. project: of Weights & Biases, which gets the metrics too; may raise
-        `TrackingError`.
+        continue, or None. Raises as `Run`, before a folder is made if the package `wandb` is
+        missing.
         """
         kept = dataclasses.replace(settings, resume=None)
         if project:
             trackers.check(project)
         if settings.resume is None:
-            run = cls.create(hosts.own(settings.runs), name, kept)
-        else:
-            run = cls.open(hosts.own_copy(settings.resume), step, kept)
-        run._track(project, kept)
-        return run
+            return cls.create(hosts.own(settings.runs), name, kept, project)
+        return cls(hosts.own_copy(settings.resume), kept, step, project)
 
-    def part(self, name: str, step: int, settings: Any) -> Self:
-        """A run in the folder `name` inside this one: made, or continued like `open` does."""
+    def part(self, name: str, step: int, settings: Any) -> "Run":
+        """A run in the folder `name` inside this one: begun, or continued from `step`."""
         folder = self.folder / name
-        with _refused(f"{folder}: cannot start a run there"):
-            if (folder / METRICS).is_file():
-                part = self.open(folder, step, settings)
-            else:
-                folder.mkdir(exist_ok=True)
-                part = self._begin(folder, settings)
-        part.outermost = self.outermost
-        part._track(self._project, settings)
-        return part
-
-    def _track(self, project: str | None, settings: Any) -> None:
-        self._project = project
-        if project and hosts.is_first():
-            self._tracker = trackers.begin(project, self.folder, self.outermost, settings)
-
-    @classmethod
-    def _begin(cls, folder: Path, settings: Any) -> Self:
-        config.save(settings, folder / "config.yaml")
-        (folder / METRICS).touch()
-        return cls(folder, Events(folder))
+        begun = (folder / METRICS).is_file()
+        return Run(folder, settings, step if begun else None, self.project, self.outermost)
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
         """Record scalars at `step` in `metrics.jsonl` and for TensorBoard.
@@ -162,13 +148,11 @@ class Progress:
         self._bar = rich.progress.Progress(
             rich.progress.TextColumn("{task.description}"),
             rich.progress.BarColumn(),
-            rich.progress.TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
-            rich.progress.TimeRemainingColumn(),
-            rich.progress.TextColumn("{task.fields[note]}"),
+            rich.progress.TextColumn("{task.fields[standing]}"),
             console=self._console,
             disable=not self._console.is_terminal,
         )
-        self._task = self._bar.add_task(description, total=total, note="")
+        self._task = self._bar.add_task(description, total=total, standing=f"0/{total:,}")
 
     def __enter__(self) -> Self:
         self._start = self._last = time.monotonic()
@@ -179,21 +163,18 @@ class Progress:
         self._bar.stop()
 
     def advance(self, amount: int = 1, note: str = "") -> None:
-        """Count `amount` more units as done; `note` is shown beside the rate."""
+        """Count `amount` more units as done; `note` is shown beside rate and time left."""
         self._done += amount
         now = time.monotonic()
         rate = self._done / max(now - self._start, 1e-9)
         pace = f"{1 / rate:,.0f} s each" if 0 < rate < 1 else f"{rate:,.0f}/s"
-        self._bar.update(self._task, advance=amount, note=f"{pace}  {note}")
+        left = max(self._total - self._done, 0) / max(rate, 1e-9)
+        standing = f"{self._done:,}/{self._total:,}  {pace}  {left:,.0f} s left  {note}".rstrip()
+        self._bar.update(self._task, advance=amount, standing=standing)
         due = now - self._last >= SECONDS_BETWEEN_LINES or self._done >= self._total
         if due and not self._console.is_terminal:
             self._last = now
-            left = max(self._total - self._done, 0) / max(rate, 1e-9)
-            print(
-                f"{self._description} {self._done:,}/{self._total:,}  {pace}  "
-                f"{left:,.0f} s left  {note}".rstrip(),
-                flush=True,
-            )
+            print(f"{self._description} {standing}", flush=True)
 
 
 def read_metrics(folder: str | Path) -> list[dict[str, float]]:
@@ -241,12 +222,3 @@ def _append(path: Path, line: str) -> None:
             raise
         finally:
             os.close(descriptor)
-
-
-def _make_folder(root: Path, name: str) -> Path:
-    folder, number = root / name, 1
-    while folder.exists():
-        number += 1
-        folder = root / f"{name}-{number}"
-    folder.mkdir(parents=True)
-    return folder

@@ -7,12 +7,9 @@ import time
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from vertiwm_jax.errors import UserError
-
-if TYPE_CHECKING:
-    from wandb import Run as Tracker
 
 # tensorboardX imports PyTorch wherever it is installed, for tensors that we do not have: this would
 # take two seconds of every start and half a gigabyte. Where it is there already, it stays.
@@ -31,27 +28,23 @@ finally:
         del sys.modules["torch"]
 
 
-class Events:
+class Events(EventsWriter):
     """A new file of events in a run's folder `events`. What the system refuses raises `OSError`."""
 
     def __init__(self, folder: Path) -> None:
         # Written in this thread: a background writer would lose a full disk's error, then hang.
-        self._writer = EventsWriter(str(folder / "events"), filename_suffix=f".{time.time_ns()}")
+        super().__init__(str(folder / "events"), filename_suffix=f".{time.time_ns()}")
 
     def restart(self, step: int) -> None:
         """Makes TensorBoard hide what earlier files hold from this step on."""
         restart = SessionLog(status=SessionLog.START)
-        self._writer.write_event(Event(wall_time=time.time(), step=step, session_log=restart))
+        self.write_event(Event(wall_time=time.time(), step=step, session_log=restart))
 
     def log(self, step: int, wall_time: float, values: Mapping[str, float]) -> None:
         """Records scalars; they have been handed to the operating system on return."""
         for name, value in values.items():
-            event = Event(wall_time=wall_time, step=step, summary=scalar(name, value))
-            self._writer.write_event(event)
-        self._writer.flush()
-
-    def close(self) -> None:
-        self._writer.close()
+            self.write_event(Event(wall_time=wall_time, step=step, summary=scalar(name, value)))
+        self.flush()
 
 
 class TrackingError(UserError):
@@ -66,7 +59,7 @@ def check(project: str) -> None:
         )
 
 
-def begin(project: str, folder: Path, outermost: Path, settings: Any) -> "Tracker":
+def begin(project: str, folder: Path, outermost: Path, settings: Any) -> Any:
     """A run of that project, continued if it exists; its files lie in `folder`.
 
     outermost: folder of the run that this is a part of, or its own; its name names the group.

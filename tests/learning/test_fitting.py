@@ -112,7 +112,7 @@ def test_a_fit_that_was_stopped_ends_with_the_same_bits(new_run, monkeypatch):
         with pytest.raises(TrainingInterrupted, match="iteration 3 of 6"):
             go(stopped_run)
     assert fitting.load(stopped_run.folder, params()) is None
-    resumed = go(Run.open(stopped_run.folder, 3, CONFIG))
+    resumed = go(Run(stopped_run.folder, CONFIG, 3))
     chex.assert_trees_all_equal(straight, resumed)
     assert numbers(stopped_run) == numbers(straight_run)
 

@@ -59,7 +59,7 @@ def test_resumed_training_ends_with_the_same_bits(new_run, monkeypatch):
         interrupt_at(patch, 3)
         with pytest.raises(TrainingInterrupted, match=r"iteration 3 of 6.*--resume"):
             go(ppo, stopped_run, ppo.iterations)
-    resumed = go(ppo, Run.open(stopped_run.folder, 3, CONFIG), ppo.iterations)
+    resumed = go(ppo, Run(stopped_run.folder, CONFIG, 3), ppo.iterations)
     chex.assert_trees_all_equal(straight, resumed)
 
     def numbers(run):
