@@ -38,8 +38,9 @@ from benchmarks._programs import Job, Program, compiled
 from benchmarks.models import drives, driving
 from vertiwm_jax import atomic, runs, training
 from vertiwm_jax import config as configuration
-from vertiwm_jax.env.navigation import NavigationConfig
+from vertiwm_jax.env.navigation import NavigationConfig, NavigationEnv
 from vertiwm_jax.env.suites import GroundConfig
+from vertiwm_jax.env.task import TaskParams
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
@@ -82,9 +83,11 @@ class Benchmark:
     end: float = 0.0
 
     @cached_property
-    def task(self) -> experiment.Task:
+    def task(self) -> tuple[NavigationEnv, TaskParams]:
         """What the training learns."""
-        return experiment.training_environment(self.config)[0]
+        config = self.config
+        terrain, pool, _ = experiment.training_ground(config)
+        return experiment.environment(config, config.model, terrain, pool, config.variation)
 
     def driven(self, name: ModelName, vehicles: int) -> Job:
         """Rollouts of a model."""
@@ -94,9 +97,9 @@ class Benchmark:
     def learned(self, environments: int, **settings: Any) -> Job:
         """An iteration of PPO inside Verti-WM, with other settings."""
         ppo = replace(self.config.ppo, num_envs=environments, **settings)
-        algorithm = training.Seeds(replace(self.config, ppo=ppo).algorithm(self.task.env), 1)
-        state = training.begin(algorithm, self.task.params, jax.random.key(0))
-        return algorithm.iterate, (self.task.params, state)
+        env, task = self.task
+        algorithm = training.Seeds(replace(self.config, ppo=ppo).algorithm(env), 1)
+        return algorithm.iterate, (task, training.begin(algorithm, task, jax.random.key(0)))
 
     @cached_property
     def usual(self) -> Program:

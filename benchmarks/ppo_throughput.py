@@ -20,6 +20,7 @@ from benchmarks.models import PAPER
 from vertiwm_jax import config as configuration
 from vertiwm_jax import parallel
 from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.env.task import TaskParams
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models import files
@@ -27,7 +28,8 @@ from vertiwm_jax.models.config import Size
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.networks.specialist import ComputeDtype
 from vertiwm_jax.rl import experiment
-from vertiwm_jax.rl.experiment import PPOTraining
+from vertiwm_jax.rl.algorithm import PolicyAlgorithm
+from vertiwm_jax.rl.experiment import PPOTraining, TrainConfig
 from vertiwm_jax.rl.ppo import PPO
 from vertiwm_jax.training import Seeds
 
@@ -55,7 +57,7 @@ class IdleEnv(environment.Environment):
         return spaces.Box(-1.0, 1.0, (2,))
 
 
-def iteration(ppo: PPO, params: Any) -> Figures:
+def iteration(ppo: PolicyAlgorithm[Any], params: Any) -> Figures:
     """On as many devices as a training has, and on one of them, with all cores to itself."""
     algorithm, results = Seeds(ppo, 1), {}
     start = jax.jit(algorithm.init)(params, jax.random.key(0))
@@ -74,8 +76,14 @@ def of_task(name: str, model: ModelName, weights: Path | None, dtype: ComputeDty
     file = configuration.default_config(name)
     config = configuration.load(PPOTraining, file)
     config = replace(config, model=model, weights=weights, compute_dtype=dtype)
-    training, _ = experiment.training_environment(config)
-    return iteration(config.algorithm(training.env), training.params)
+    return iteration(*training(config))
+
+
+def training(config: TrainConfig) -> tuple[PolicyAlgorithm[Any], TaskParams]:
+    """The algorithm of a training, and what it learns from."""
+    terrain, pool, _ = experiment.training_ground(config)
+    env, task = experiment.environment(config, config.model, terrain, pool, config.variation)
+    return config.algorithm(env), task
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ follows.
 from dataclasses import replace
 
 from benchmarks._harness import Figures, parser, report
-from benchmarks.ppo_throughput import iteration
+from benchmarks.ppo_throughput import iteration, training
 from vertiwm_jax import config as configuration
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
@@ -18,8 +18,7 @@ def of_task(name: str, model: ModelName) -> Figures:
     config = experiment.load(configuration.default_config(name))
     soon = replace(getattr(config, name), learning_starts=config.schedule.num_envs)
     config = replace(config, model=model, **{name: soon})
-    training, _ = experiment.training_environment(config)
-    return iteration(config.algorithm(training.env), training.params)
+    return iteration(*training(config))
 
 
 def main() -> None:

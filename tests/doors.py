@@ -15,6 +15,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from vertiwm_jax import cli
 from vertiwm_jax import config as configuration
+from vertiwm_jax.env import suites
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.rl import experiment, policy
@@ -85,10 +86,11 @@ def untrained(kind: type[TrainConfig], run: Path) -> list[DeterministicPolicy]:
     """Policies of random weights, one a seed, left as those of the run beside `config.yaml`."""
     config = configuration.load(kind, run / "config.yaml")
     level = TerrainMap.from_array(np.zeros((129, 129)), np.zeros((1, 1), int))
-    training = experiment.test_environment(config, level)
-    algorithm = config.algorithm(training.env)
+    pool = suites.test_tasks(config.ground, level)
+    env, task = experiment.environment(config, "builtin", level, pool)
+    algorithm = config.algorithm(env)
     keys = jax.random.split(jax.random.key(0), config.loop.seeds)
-    shapes = jax.eval_shape(jax.vmap(algorithm.init, (None, 0)), training.params, keys)
+    shapes = jax.eval_shape(jax.vmap(algorithm.init, (None, 0)), task, keys)
     rng = np.random.default_rng(0)
 
     def drawn(leaf):

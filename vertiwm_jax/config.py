@@ -267,6 +267,14 @@ def choices(name: str, known: Iterable[str]) -> str:
     return f"one of {', '.join(known) or '(none)'}{_hint(name, known)}"
 
 
+def expect_fields(names: Iterable[str], *of: Any, where: str = "") -> None:
+    """`ConfigError` for the first name that is a field of none of these dataclasses."""
+    known = sorted({field.name for each in of for field in dataclasses.fields(each)})
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"{where}{name}: unknown setting, expected {choices(name, known)}")
+
+
 def _hint(name: str, known: Iterable[str]) -> str:
     closest = difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {closest[0]!r}?" if closest else ""

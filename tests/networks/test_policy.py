@@ -9,7 +9,6 @@ import scipy.stats
 from vertiwm_jax.networks import policy
 from vertiwm_jax.networks.policy import (
     LOG_STD_BOUNDS,
-    ActionCritic,
     Actor,
     Candidates,
     Critic,
@@ -199,8 +198,8 @@ def test_a_certain_actor_draws_what_it_means():
     np.testing.assert_array_equal(drawn, policy.mean)
 
 
-def test_action_critic_weighs_actions():
-    critic = ActionCritic(hidden=(8,))
+def test_a_critic_weighs_actions():
+    critic = Critic(hidden=(8,))
     observation, action = jnp.ones((3, 4, 5)), jnp.zeros((3, 4, 2))
     params = critic.init(jax.random.key(0), observation, action)
     value = critic.apply(params, observation, action)

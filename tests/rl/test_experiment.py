@@ -7,6 +7,7 @@ import pytest
 
 from vertiwm_jax import config, machine
 from vertiwm_jax.config import ConfigError
+from vertiwm_jax.env import suites
 from vertiwm_jax.env.suites import GroundConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.rl import experiment
@@ -23,9 +24,10 @@ def test_a_rover_is_tested_on_soil_of_its_scale():
     np.testing.assert_array_equal(small.elevation, ground.elevation)
     sand = STANDARD.names.index("sand")
     np.testing.assert_allclose(small.soils.cohesion[0, sand], 10 * ground.soils.cohesion[0, sand])
-    test = experiment.test_environment(rover, small)
-    assert np.isfinite(test.params.starts.vehicle.vector).all()
-    for found in (test.params.dynamics.vehicle, test.params.vehicle):
+    pool = suites.test_tasks(rover.ground, small)
+    _, task = experiment.environment(rover, "builtin", small, pool)
+    assert np.isfinite(task.starts.vehicle.vector).all()
+    for found in (task.dynamics.vehicle, task.vehicle):
         jax.tree.map(np.testing.assert_array_equal, found, vehicle.load("rover").vehicle)
 
 

@@ -1,7 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.rl.gae import gae
+from vertiwm_jax.rl.ppo import gae
 
 RNG = np.random.default_rng(0)
 T, N = 12, 5

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vertiwm_jax.rl.replay import Replay
+from vertiwm_jax.rl.off_policy import Replay
 
 ROW = {"a": jnp.zeros(2), "b": jnp.int32(0)}
 

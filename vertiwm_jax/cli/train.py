@@ -7,6 +7,6 @@ from vertiwm_jax.rl import experiment
 
 def run(name: str, words: list[str]) -> None:
     config = arguments.with_file(experiment.TRAININGS[name], name, name, words)
-    trained = experiment.run(config)
-    print(f"\n{report.after_training(trained)}\n")
-    print(f"all of it is in {trained.folder}")
+    trained, folder, held_out = experiment.run(config)
+    print(f"\n{report.after_training(trained, folder, held_out)}\n")
+    print(f"all of it is in {folder}")

@@ -135,9 +135,9 @@ def _train(row: Row, settings: TrainConfig, folder: Path) -> Path:
     if begun:
         kept = configuration.load(type(settings), begun / "config.yaml")
         settings = replace(settings, compute_dtype=kept.compute_dtype)
-    trained = experiment.run(replace(settings, runs=place, resume=begun))
-    _log.info("\n%s\n", report.after_training(trained))
-    return trained.folder
+    trained, run, held_out = experiment.run(replace(settings, runs=place, resume=begun))
+    _log.info("\n%s\n", report.after_training(trained, run, held_out))
+    return run
 
 
 def _learned(row: Row, settings: TrainConfig, folder: Path) -> dict[str, Policy | Agent]:

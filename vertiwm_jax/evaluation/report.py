@@ -26,7 +26,7 @@ from vertiwm_jax.planning.improvement import ImprovementConfig
 from vertiwm_jax.planning.mppi import MPPI, MPPIConfig
 from vertiwm_jax.planning.shooting import Shooting, ShootingConfig
 from vertiwm_jax.rl import experiment
-from vertiwm_jax.rl.experiment import TaskConfig, TrainConfig, Trained
+from vertiwm_jax.rl.experiment import TaskConfig, TrainConfig
 from vertiwm_jax.simulators import processes
 from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.terrain import files
@@ -148,21 +148,20 @@ class NavigationTest:
         return kind(NavigationEnv(dynamics, config.navigation), weights, settings)
 
 
-def after_training(trained: Trained) -> str:
+def after_training(config: TrainConfig, folder: Path, held_out: TerrainMap) -> str:
     """Tests what a training has learned, beside controllers, on the worlds held out.
 
     Writes tables and pictures into the folder of the run, also of how it learned. Returns the
     tables as Markdown.
     """
-    config, folder = trained.config, trained.folder
     columns = runs.read_columns(folder)
     labels = {name: label for name, label in CURVES.items() if name in columns}
     figure = plots.learning_curves({config.name: columns}, "timesteps", labels)
     figures.save(figure, folder / "learning_curves.png")
     machine.forget_programs()  # Tests need the memory.
     policies = experiment.learned(config, folder) | config.baselines
-    groups = drive(config, trained.held_out, policies, trained.world_suites)
-    write(folder, groups, trained.held_out, config.navigation.goal_radius)
+    groups = drive(config, held_out, policies, config.world_suites)
+    write(folder, groups, held_out, config.navigation.goal_radius)
     return markdown(groups)
 
 
@@ -188,15 +187,15 @@ def drive(
         The episodes, by suite and policy.
     """
     model = "builtin" if simulator == "chrono" else simulator
-    test, key = experiment.test_environment(config, terrain, model), config.key("testing")
-    _log.info("driving %d tasks on %d worlds ...", test.params.pool_size, terrain.worlds)
+    tasks, key = test_tasks(config.ground, terrain), config.key("testing")
+    env, task = experiment.environment(config, model, terrain, tasks)
+    _log.info("driving %d tasks on %d worlds ...", task.pool_size, terrain.worlds)
     results = {}
     with processes.simulating(jobs) as mapped:
         for name, policy in policies.items():
             start = time.perf_counter()
-            inputs = test.env, test.params, policy, key
+            inputs = env, task, policy, key
             if simulator == "chrono":
-                tasks = test_tasks(config.ground, terrain)
                 results[name] = external.evaluate(Chrono, mapped, tasks, *inputs)
             else:
                 results[name] = run_episodes(*inputs)

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -97,11 +97,7 @@ def fit(
         DataError, MapError: drives or their maps are malformed or too few.
     """
     chosen = configuration.load(FitConfig, configuration.find(config))
-    known = [field.name for field in fields(FitConfig)]
-    for name in settings:
-        if name not in known:
-            expected = configuration.choices(name, known)
-            raise ConfigError(f"{name}: unknown setting, expected {expected}")
+    configuration.expect_fields(settings, chosen)
     data = [drives] if isinstance(drives, str | Path) else drives
     settings |= {"data": tuple(map(Path, data)), "runs": Path(runs)}
     settings |= {"start": Path(start)} if start else {}

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from operator import mul
 from pathlib import Path
@@ -13,7 +13,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax.config import ConfigError
 from vertiwm_jax.geometry import wrap
 from vertiwm_jax.learning import windows
 from vertiwm_jax.learning.dataset import load_drives
@@ -61,10 +60,7 @@ def identify(
         DataError, MapError: drives or their maps are malformed, or all drives are too short.
     """
     begin = vehicles.load(vehicle) if isinstance(vehicle, str) else vehicle
-    known = [field.name for field in fields(VehicleConfig)]
-    for name in free:
-        if name not in known:
-            raise ConfigError(f"free: {name}: expected {configuration.choices(name, known)}")
+    configuration.expect_fields(free, VehicleConfig, where="free: ")
     recorded, terrain = load_drives(drives, "train")
     index = windows.index(recorded, terrain, _CONTEXT, horizon, horizon)
     every = -(-len(index.start) // _MOST_WINDOWS)

@@ -203,15 +203,16 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """`[..., O]` observations to `[...]` values."""
+    """`[..., O]` observations, and `[..., A]` actions if it judges those, to `[...]` values."""
 
     hidden: Sequence[int]
     layout: ObservationLayout = ObservationLayout()
 
     @nn.compact
-    def __call__(self, observation: jax.Array) -> jax.Array:
+    def __call__(self, observation: jax.Array, *action: jax.Array) -> jax.Array:
         features, _, hidden = _look(observation, self.hidden, self.layout)
-        return MLP(hidden, 1, output_gain=1.0)(features)[..., 0]
+        inputs = jnp.concatenate([features, *action], axis=-1)
+        return MLP(hidden, 1, output_gain=1.0)(inputs)[..., 0]
 
 
 class TanhNormalActor(nn.Module):
@@ -237,21 +238,8 @@ class TanhNormalActor(nn.Module):
         return TanhNormal(Gaussian(attended + mean, _log_std(raw + _raw(self.initial_log_std))))
 
 
-class ActionCritic(nn.Module):
-    """`[..., O]` observations and `[..., A]` actions to `[...]` values."""
-
-    hidden: Sequence[int]
-    layout: ObservationLayout = ObservationLayout()
-
-    @nn.compact
-    def __call__(self, observation: jax.Array, action: jax.Array) -> jax.Array:
-        features, _, hidden = _look(observation, self.hidden, self.layout)
-        inputs = jnp.concatenate([features, action], axis=-1)
-        return MLP(hidden, 1, output_gain=1.0)(inputs)[..., 0]
-
-
 def twin_values(
-    critic: ActionCritic, params: Any, observation: jax.Array, action: jax.Array
+    critic: Critic, params: Any, observation: jax.Array, action: jax.Array
 ) -> jax.Array:
     """`[2, ...]` values of actions, by two critics whose weights are stacked."""
     values = jax.vmap(critic.apply, (0, None, None))(params, observation, action)

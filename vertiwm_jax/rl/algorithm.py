@@ -14,13 +14,7 @@ from gymnax.environments.environment import Environment
 
 from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, Positive, Share, settings
-from vertiwm_jax.networks.policy import (
-    ActionCritic,
-    Actor,
-    Critic,
-    ObservationLayout,
-    TanhNormalActor,
-)
+from vertiwm_jax.networks.policy import Actor, Critic, ObservationLayout, TanhNormalActor
 from vertiwm_jax.rl.policy import DeterministicPolicy, Value
 from vertiwm_jax.rl.running_statistics import RunningStatistics
 from vertiwm_jax.training import Algorithm
@@ -181,7 +175,7 @@ class PolicyAlgorithm(Algorithm[S]):
 
     @property
     @abstractmethod
-    def critic(self) -> Critic | ActionCritic:
+    def critic(self) -> Critic:
         """The network of values."""
 
     @abstractmethod

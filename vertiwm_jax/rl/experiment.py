@@ -1,7 +1,7 @@
 """Driving policies as what is learned: the settings of a training, its environments, and `run`."""
 
 import logging
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, cast
 
@@ -9,7 +9,7 @@ import jax
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import machine, training
-from vertiwm_jax.config import ConfigError, Count
+from vertiwm_jax.config import Count
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import controllers, suites
 from vertiwm_jax.env.agent import Agent, Policy
@@ -207,36 +207,17 @@ def load(file: Path) -> TrainConfig:
     return configuration.load(named[0] if named else PPOTraining, file)
 
 
-@dataclass(frozen=True)
-class Task:
-    """An environment and its parameters."""
-
-    env: NavigationEnv
-    params: TaskParams
-
-
-def training_environment(config: TaskConfig) -> tuple[Task, TerrainMap]:
-    """What to train in, and the worlds held out for `test_environment`.
-
-    Raises like `training_ground`; weights that cannot be read raise `CheckpointError`.
-    """
-    terrain, pool, held_out = training_ground(config)
-    return environment(config, config.model, terrain, pool, config.variation), held_out
-
-
 def training_ground(
     config: TaskConfig, worlds: TerrainMap | None = None
 ) -> tuple[TerrainMap, Tasks, TerrainMap]:
-    """The worlds to train on, tasks on them, and the worlds held out for `test_environment`.
+    """The worlds to train on, tasks on them, and the worlds held out for tests.
 
     worlds: to train and to test on, in place of those of the configuration. Raises `MapError` or
     `TaskError` where maps, or tasks on them, cannot be used.
     """
     navigation, driven = config.navigation, config.driven
-    key = config.key("worlds")
-    terrain = held_out = worlds
-    if terrain is None or held_out is None:
-        terrain, held_out = suites.grounds(config.ground, config.terrain, key, driven.scale)
+    asked = config.ground, config.terrain, config.key("worlds"), driven.scale
+    terrain, held_out = (worlds, worlds) if worlds else suites.grounds(*asked)
     # Now, and not when the training is over.
     tests = suites.test_tasks(config.ground, held_out)
     suites.validate(tests, held_out, navigation.goal_radius, navigation.map_margin)
@@ -245,16 +226,11 @@ def training_ground(
 
 
 def held_out(config: TaskConfig) -> TerrainMap:
-    """The worlds that `training_environment` holds out."""
+    """The worlds that a training holds out."""
     key, scale = config.key("worlds"), config.driven.scale
     if config.terrain is None:
         return suites.suite_worlds(config.ground, key, scale)
     return suites.grounds(config.ground, config.terrain, key, scale)[1]
-
-
-def test_environment(config: TaskConfig, terrain: TerrainMap, model: ModelName = "builtin") -> Task:
-    """The test on these worlds, inside one of the models."""
-    return environment(config, model, terrain, suites.test_tasks(config.ground, terrain))
 
 
 def environment(
@@ -263,12 +239,11 @@ def environment(
     terrain: TerrainMap,
     pool: Tasks,
     variation: RandomizationConfig = RandomizationConfig(),
-) -> Task:
-    """Tasks inside one of the models."""
+) -> tuple[NavigationEnv, TaskParams]:
+    """Tasks inside one of the models; weights that cannot be read raise `CheckpointError`."""
     moves, params = dynamics(config, model)
     env = NavigationEnv(moves, config.navigation, variation)
-    made = env.make_params(params, terrain, pool, config.driven.vehicle, encoders(config))
-    return Task(env, made)
+    return env, env.make_params(params, terrain, pool, config.driven.vehicle, encoders(config))
 
 
 def dynamics(
@@ -302,22 +277,12 @@ def outcomes(info: dict[str, jax.Array]) -> dict[str, jax.Array]:
     }
 
 
-@dataclass(frozen=True)
-class Trained:
-    """What a training has left: its folder, with what has learned, and worlds to test it on.
-
-    world_suites: of each of these worlds; None where they were given.
-    """
-
-    config: TrainConfig
-    folder: Path
-    held_out: TerrainMap
-    world_suites: list[Suite] | None
-
-
-def run(config: TrainConfig, worlds: TerrainMap | None = None) -> Trained:
+def run(
+    config: TrainConfig, worlds: TerrainMap | None = None
+) -> tuple[TrainConfig, Path, TerrainMap]:
     """Trains, or goes on with, the policies of one training; worlds: as in `training_ground`.
 
+    Gives the settings as they were trained with, the folder of the run, and the worlds held out.
     Tells by logging what it does. Raises `UserError` where settings, maps, tasks, an earlier run or
     the disk do not allow it, and `TrainingInterrupted` at Ctrl-C once all is saved.
     """
@@ -358,7 +323,7 @@ def run(config: TrainConfig, worlds: TerrainMap | None = None) -> Trained:
             seeds, params, key, begun, iterations, work, config.loop, restored, keep
         )
         keep(state)
-    return Trained(config, begun.folder, held_out, None if worlds else config.world_suites)
+    return config, begun.folder, held_out
 
 
 @float32
@@ -392,11 +357,8 @@ def train(
         TrainingInterrupted: Ctrl-C stopped it, once all was saved.
     """
     chosen = load(Path(resume) / "config.yaml" if resume else configuration.find(config))
-    own, of_algorithm = ({field.name for field in fields(x)} for x in (chosen, chosen.schedule))
-    for name in settings:
-        if name not in own | of_algorithm:
-            expected = configuration.choices(name, sorted(own | of_algorithm))
-            raise ConfigError(f"{name}: unknown setting, expected {expected}")
+    configuration.expect_fields(settings, chosen, chosen.schedule)
+    own = {field.name for field in fields(chosen)}
     changed = {name: settings[name] for name in settings if name in own}
     schedule = {name: settings[name] for name in settings if name not in own}
     if schedule:
@@ -405,7 +367,8 @@ def train(
         changed["terrain"] = Path(terrain)
     changed |= {"runs": Path(runs), "resume": Path(resume) if resume else None}
     given = terrain if isinstance(terrain, TerrainMap) else None
-    return load_policy(run(replace(chosen, **changed), given).folder)
+    _, folder, _ = run(replace(chosen, **changed), given)
+    return load_policy(folder)
 
 
 def learned(config: TrainConfig, folder: Path) -> Rows:

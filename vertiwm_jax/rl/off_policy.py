@@ -8,7 +8,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +17,9 @@ from flax import struct
 
 from vertiwm_jax import parallel
 from vertiwm_jax.config import ConfigError, Count, NotNegative, Positive, Share, settings
-from vertiwm_jax.networks.policy import ActionCritic, TanhNormal, TanhNormalActor, twin_values
+from vertiwm_jax.networks.policy import Critic, TanhNormal, TanhNormalActor, twin_values
 from vertiwm_jax.precision import float32
 from vertiwm_jax.rl.algorithm import LearningConfig, LearningState, Metrics, PolicyAlgorithm, Steps
-from vertiwm_jax.rl.replay import Replay
 from vertiwm_jax.training import all_finite
 
 Params = Any
@@ -82,6 +81,45 @@ class Remembered:
 
 
 @struct.dataclass
+class Replay:
+    """A ring buffer of rows, kept on the device to be learned from again.
+
+    rows: leaves `[capacity, ...]`; place: `[]` int32 where the next row goes; filled: `[]` int32
+    rows that hold something.
+    """
+
+    rows: Any
+    place: jax.Array
+    filled: jax.Array
+
+    @classmethod
+    def create(cls, row: Any, capacity: int) -> Self:
+        """Room for `capacity` rows like `row`, leaves `[...]`."""
+        rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), row)
+        return cls(rows, jnp.int32(0), jnp.int32(0))
+
+    def add(self, rows: Any) -> Self:
+        """With N more rows, leaves `[N, ...]`, in place of the oldest; N divides the capacity."""
+        capacity, number = (len(jax.tree.leaves(x)[0]) for x in (self.rows, rows))
+        assert capacity % number == 0, (capacity, number)
+
+        def write(ring: jax.Array, new: jax.Array) -> jax.Array:
+            return jax.lax.dynamic_update_slice_in_dim(ring, new, self.place, axis=0)
+
+        return replace(
+            self,
+            rows=jax.tree.map(write, self.rows, rows),
+            place=(self.place + number) % capacity,
+            filled=jnp.minimum(self.filled + number, capacity),
+        )
+
+    def sample(self, key: jax.Array, number: int) -> Any:
+        """Rows drawn evenly with replacement, leaves `[number, ...]`; it must hold some."""
+        chosen = jax.random.randint(key, (number,), 0, self.filled)
+        return jax.tree.map(lambda x: x[chosen], self.rows)
+
+
+@struct.dataclass
 class Learner:
     """What both have learned: weights, and the states of Adam.
 
@@ -127,8 +165,8 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState]):
         return TanhNormalActor(self.actions, config.hidden, log_std, self.layout)
 
     @property
-    def critic(self) -> ActionCritic:
-        return ActionCritic(self.config.hidden, self.layout)
+    def critic(self) -> Critic:
+        return Critic(self.config.hidden, self.layout)
 
     def weights(self, state: OffPolicyState) -> tuple[Params, Params]:
         return state.learner.averaged, state.learner.critics
@@ -150,14 +188,26 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState]):
         """The state before the first iteration."""
         key, reset_key, learner_key = jax.random.split(key, 3)
         begun = self.start(data, reset_key, key)
-        observation = begun["environments"].observation[0]
-        nothing = jnp.zeros(self.actions), jnp.float32(0), jnp.array(False)
-        row = Remembered(observation, observation, *nothing)
-        return OffPolicyState(
-            **begun,
-            learner=self._init_learner(observation, learner_key),
-            replay=Replay.create(row, self.config.buffer_size),
+        observation, action = begun["environments"].observation[0], jnp.zeros(self.actions)
+        actor_key, critic_key = jax.random.split(learner_key)
+        # One after the other, as `training.Seeds` does with seeds.
+        critics = jax.lax.map(
+            lambda key: self.critic.init(key, observation, action), jax.random.split(critic_key)
         )
+        actor = self.actor.init(actor_key, observation)
+        # Targets are copies of their own, for states are donated.
+        learner = Learner(
+            actor=actor,
+            averaged=jax.tree.map(jnp.array, actor),
+            critics=critics,
+            target=jax.tree.map(jnp.array, critics),
+            actor_optimizer=self.optimizer.init(actor),
+            critic_optimizer=self.optimizer.init(critics),
+            extra=self.init_extra(),
+        )
+        row = Remembered(observation, observation, action, jnp.float32(0), jnp.array(False))
+        replay = Replay.create(row, self.config.buffer_size)
+        return OffPolicyState(**begun, learner=learner, replay=replay)
 
     @float32
     def iterate(self, data: Params, state: OffPolicyState) -> tuple[OffPolicyState, Metrics]:
@@ -187,25 +237,6 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState]):
             "finite": all_finite(state.learner),
         }
         return replace(state, iteration=state.iteration + 1, key=key), metrics
-
-    def _init_learner(self, observation: jax.Array, key: jax.Array) -> Learner:
-        actor_key, critic_key = jax.random.split(key)
-        action = jnp.zeros(self.actions)
-        # One after the other, as `training.Seeds` does with seeds.
-        critics = jax.lax.map(
-            lambda key: self.critic.init(key, observation, action), jax.random.split(critic_key)
-        )
-        actor = self.actor.init(actor_key, observation)
-        # Targets are copies of their own, for states are donated.
-        return Learner(
-            actor=actor,
-            averaged=jax.tree.map(jnp.array, actor),
-            critics=critics,
-            target=jax.tree.map(jnp.array, critics),
-            actor_optimizer=self.optimizer.init(actor),
-            critic_optimizer=self.optimizer.init(critics),
-            extra=self.init_extra(),
-        )
 
     def distribution(self, actor: Params, observation: jax.Array) -> TanhNormal:
         """The policy at normalized observations `[..., O]`."""

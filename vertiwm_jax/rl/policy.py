@@ -21,7 +21,6 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.networks.policy import (
-    ActionCritic,
     Actor,
     Critic,
     Gaussian,
@@ -65,12 +64,12 @@ class DeterministicPolicy:
 class Value:
     """The return that a learned policy can expect, as far as it was learned.
 
-    critic: the network, static; params: its weights. A critic of actions has two sets of them, with
-        an axis for both, and the lower value counts.
+    critic: the network, static; params: its weights. There are two sets of them, with an axis for
+        both, unless PPO learned it: these judge actions, and the lower value counts.
     policy: whose return it is; scale: `[]` of the critic's output.
     """
 
-    critic: Critic | ActionCritic = struct.field(pytree_node=False)
+    critic: Critic = struct.field(pytree_node=False)
     params: Any
     policy: DeterministicPolicy
     scale: jax.Array
@@ -78,7 +77,7 @@ class Value:
     def __call__(self, observation: jax.Array) -> jax.Array:
         """`[..., O]` observations to `[...]` values, in units of reward."""
         seen = self.policy.observations.normalize(observation)
-        if isinstance(self.critic, Critic):
+        if isinstance(self.policy.actor, Actor):
             return self.scale * cast(jax.Array, self.critic.apply(self.params, seen))
         values = twin_values(self.critic, self.params, seen, self.policy(observation))
         return self.scale * jnp.min(values, axis=0)
@@ -119,14 +118,12 @@ class PolicyConfig:
         return baselines(self.navigation, self.vehicle.vehicle).get(self.base)
 
     @property
-    def networks(self) -> tuple[Actor | TanhNormalActor, Critic | ActionCritic]:
+    def networks(self) -> tuple[Actor | TanhNormalActor, Critic]:
         """Actor and critic."""
-        layout, std = self.navigation.observed.layout, self.initial_log_std
-        if self.algorithm == "ppo":
-            assert std is not None
-            return Actor(_ACTIONS, self.hidden, std, layout), Critic(self.hidden, layout)
-        actor = TanhNormalActor(_ACTIONS, self.hidden, std, layout)
-        return actor, ActionCritic(self.hidden, layout)
+        layout = self.navigation.observed.layout
+        kind = Actor if self.algorithm == "ppo" else TanhNormalActor
+        actor = kind(_ACTIONS, self.hidden, cast(Any, self.initial_log_std), layout)
+        return actor, Critic(self.hidden, layout)
 
 
 @struct.dataclass
@@ -229,11 +226,11 @@ def load_policy(folder: str | Path, seed: int = 0) -> Policy:
 
 
 def _untrained(
-    actor: Actor | TanhNormalActor, critic: Critic | ActionCritic, observation: jax.Array
+    actor: Actor | TanhNormalActor, critic: Critic, observation: jax.Array
 ) -> dict[str, Any]:
     """Weights of the shapes that were stored."""
     key = jax.random.key(0)
-    if isinstance(critic, Critic):
+    if isinstance(actor, Actor):
         critics = critic.init(key, observation)
     else:
         twins = jax.vmap(critic.init, (0, None, None))

@@ -22,7 +22,6 @@ from vertiwm_jax.networks.policy import Actor, Critic, Gaussian
 from vertiwm_jax.parallel import BATCH, ROWS, WHOLE
 from vertiwm_jax.precision import float32
 from vertiwm_jax.rl.algorithm import LearningConfig, LearningState, Metrics, PolicyAlgorithm, Steps
-from vertiwm_jax.rl.gae import gae
 from vertiwm_jax.training import all_finite, mean_in_turns
 
 Params = Any
@@ -297,3 +296,34 @@ def take(leaf: jax.Array, rows: jax.Array, *numbers: slice) -> jax.Array:
     """Of `[T, N, ...]` the steps `[N, R]` of each environment, `[N R, ...]`."""
     found = jax.vmap(lambda x, row: x[row, *numbers], in_axes=(1, 0))(leaf, rows)
     return found.reshape(-1, *found.shape[2:])
+
+
+def gae(
+    rewards: jax.Array,
+    values: jax.Array,
+    next_values: jax.Array,
+    terminated: jax.Array,
+    truncated: jax.Array,
+    discount: float,
+    gae_lambda: float,
+) -> jax.Array:
+    """`[T, ...]` advantages, GAE(lambda) of Schulman et al. (2016), eq. 16.
+
+    Args:
+        rewards: `[T, ...]` of step t.
+        values: `[T, ...]` V of the observation before step t.
+        next_values: `[T, ...]` V of the observation after step t, before any automatic reset.
+        terminated: `[T, ...]` bool, the task ended: what follows is worth nothing.
+        truncated: `[T, ...]` bool, time ran out: what follows is worth `next_values`.
+        discount: gamma.
+        gae_lambda: lambda.
+    """
+    errors = rewards + discount * jnp.where(terminated, 0.0, next_values) - values
+    decays = discount * gae_lambda * ~(terminated | truncated)
+
+    def accumulate(following: jax.Array, inputs: tuple[jax.Array, jax.Array]):
+        error, decay = inputs
+        advantage = error + decay * following
+        return advantage, advantage
+
+    return jax.lax.scan(accumulate, jnp.zeros_like(values[0]), (errors, decays), reverse=True)[1]

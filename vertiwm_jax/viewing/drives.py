@@ -54,9 +54,9 @@ def of_policy(
         if not 0 <= found < count:
             raise ConfigError(f"{run}: {name}: expected 0 to {count - 1}, found {found}")
     alone = jax.tree.map(lambda x: x[task : task + 1], pool)
-    test = experiment.environment(config, model, terrain, alone)
+    env, params = experiment.environment(config, model, terrain, alone)
     name, policy = list(policies.items())[seed]
-    return drive(test.env, test.params, policy, config.key("testing"), f"{name} in {model}")
+    return drive(env, params, policy, config.key("testing"), f"{name} in {model}")
 
 
 def drive(
