@@ -90,10 +90,8 @@ def warm_up(
     Each step starts from the recorded state, and looks at the ground there, so that only what the
     state does not say (wheel speeds, steering angle, past tokens) is carried along.
     """
-    first, last = (jax.tree.map(itemgetter(i), states) for i in (0, -1))
-    before = jax.tree.map(lambda x: x[:-1], states)
-    begun = dynamics.init(params, terrain, first)
-    history, _ = _steps(dynamics, params, terrain, begun, before, commands, lambda _: None)
+    before, last = (jax.tree.map(itemgetter(i), states) for i in (slice(-1), -1))
+    *_, history = along(dynamics, params, terrain, before, commands)
     see = getattr(dynamics, "see", None)
     return replace(history, features=see(params, terrain, last)) if see else history
 
@@ -106,29 +104,15 @@ def along(
     states: VehicleState,
     commands: Command,
     read: Callable[[History], T] = lambda _: None,
-) -> tuple[VehicleState, T]:
+) -> tuple[VehicleState, T, History]:
     """A step from each of T recorded states, leaves `[T, 3]`, with the history of those before it.
 
     A model looks at the ground where the drive was. commands: `[T]`.
 
     Returns:
-        Where each step leads, leaves `[T, 3]`, and what is read of the histories after them.
+        Where each step leads, leaves `[T, 3]`; what is read of the histories after them; and the
+        last history, which has seen no ground yet.
     """
-    begun = dynamics.init(params, terrain, jax.tree.map(lambda x: x[0], states))
-    return _steps(dynamics, params, terrain, begun, states, commands, read)[1]
-
-
-def _steps(
-    dynamics: Dynamics,
-    params: Params,
-    terrain: TerrainMap,
-    begun: History,
-    states: VehicleState,
-    commands: Command,
-    read: Callable[[History], T],
-) -> tuple[History, tuple[VehicleState, T]]:
-    """The last history, which has seen no ground yet, and what `along` returns."""
-
     see = getattr(dynamics, "see", None)
 
     def seeing(history: History, features: Any) -> History:
@@ -140,7 +124,9 @@ def _steps(
         proposed, history = dynamics.step(params, terrain, history, state, command)
         return seeing(history, None), (proposed, read(history))
 
-    return jax.lax.scan(advance, seeing(begun, None), (states, commands))
+    begun = seeing(dynamics.init(params, terrain, jax.tree.map(itemgetter(0), states)), None)
+    history, (proposed, found) = jax.lax.scan(advance, begun, (states, commands))
+    return proposed, found, history
 
 
 @float32

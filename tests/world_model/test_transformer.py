@@ -85,7 +85,7 @@ def test_steps_along_a_drive_equal_the_whole_sequence(kind):
     """Recorded states do not follow from each other as predicted ones do."""
     model, params, steps = MODELS[kind], PARAMS[kind], WINDOW + 9
     drive, control = driving(1, steps), commands(steps)
-    found, _ = jax.jit(partial(along, model))(params, TERRAIN, drive, control)
+    found, *_ = jax.jit(partial(along, model))(params, TERRAIN, drive, control)
 
     @jax.jit
     def at_once(params, states, commands):
@@ -203,7 +203,7 @@ def test_encoders_and_constants_never_learn():
     model, drive = replace(MODEL, latents=True), driving(0, 2)
 
     def loss(params):
-        predicted, _ = along(model, params, TERRAIN, drive, commands(2))
+        predicted, *_ = along(model, params, TERRAIN, drive, commands(2))
         return jnp.sum(predicted.velocity**2)
 
     gradient = jax.jit(jax.grad(loss, allow_int=True))(PARAMS["patches"])

@@ -68,7 +68,7 @@ def teacher_forced(
     """
     before, after = map(VehicleState.from_vector, (window.state[:-1], window.state[1:]))
     commands = Command.from_vector(window.control)
-    predicted, found = along(dynamics, params, terrain, before, commands, read)
+    predicted, found, _ = along(dynamics, params, terrain, before, commands, read)
     return before, predicted, after, found
 
 

@@ -154,19 +154,20 @@ def fit(
         params = config.model.init_params(key, physics, constants)
     else:
         params = config.model.with_gates(start, key)
-    digests: list[str] = []
+    ended: tuple[str, ...] = ()
     for name in ("nesam", "transformer"):
         if name in config.model.parts:
-            params, digest = pipeline.specialist(name, params)
-            digests.append(digest)
-    return pipeline.gate(params, digests) if "gate" in config.model.parts else params
+            params = pipeline.specialist(name, params)
+            ended += pipeline.before
+    return pipeline.gate(params, ended) if "gate" in config.model.parts else params
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Pipeline:
     """What the stages of a fit share.
 
-    begun: what is known of the parameters that it begins with; loaded: drives that were read.
+    begun: what is known of the parameters that it begins with. before: what the next stage builds
+    on, by the digests of earlier ones. loaded: drives that were read.
     """
 
     config: PipelineConfig
@@ -176,28 +177,28 @@ class _Pipeline:
     reuse: Sequence[Path]
     begun: tuple[str, ...]
     from_nothing: bool
+    before: tuple[str, ...] = ()
     loaded: dict[Any, tuple[Drives, TerrainMap]] = field(default_factory=dict)
 
-    def specialist(self, name: Specialist, params: VertiWMParams) -> tuple[VertiWMParams, str]:
-        """The parameters with one specialist fitted, and the digest of its last stage.
+    def specialist(self, name: Specialist, params: VertiWMParams) -> VertiWMParams:
+        """The parameters with one specialist fitted.
 
         First its encoders, then for NeSAM what soils look like, then how it moves.
         """
         model, config = self.config.model, getattr(self.config, name)
-        kinds, before, digest = config.learns_from, self.begun, ""
-        sees = name == "nesam" or model.terrain == "patches"
+        kinds, sees = config.learns_from, name == "nesam" or model.terrain == "patches"
+        self.before = ()
         if self.from_nothing and sees:
-            params, digests = self._encoders(name, params)
-            before = *digests, *before
+            params = self._encoders(name, params)
+        self.before += self.begun
         if self.from_nothing and name == "nesam":
             sample = self._sample(kinds)
             measured = calibration.nesam_constants(model.nesam, self._on_its_soil(params), *sample)
             params = replace(params, nesam=measured.nesam)
 
         # What is learned of `Encoders.reduce` is learned from latents.
-        alone = Alone(model.nesam) if name == "nesam" else Alone(model.transformer, sees)
-        own = params.nesam if name == "nesam" else params.transformer
-        assert own is not None
+        alone = Alone(getattr(model, name), latents=sees and name == "transformer")
+        own = getattr(params, name)
         deviation = tuple(own.normalization.transition_deviation.tolist())
         parts = [
             ("single_steps", TeacherForcingLoss(alone, deviation), config.single_steps),
@@ -207,43 +208,36 @@ class _Pipeline:
         pair = self._on_its_soil(params).encoders[_PAIR[name]]
         pair = replace(pair, soil=None) if name == "transformer" else pair
         fitted = replace(VertiWMParams((pair,), params.vehicle), **{name: own})
-        data = self._windows(kinds)
+        data = self._data(WindowData.of, self.config.windows, kinds)
         for part, objective, schedule in parts if self.from_nothing else parts[1:]:
             if not sees:
                 trainable = [each for each in schedule.trainable if not each.startswith("encoders")]
                 schedule = replace(schedule, trainable=tuple(trainable))
             problem = WindowProblem(alone, objective, self.config.windows)
-            stage = f"{name}_{part}", problem, schedule, kinds
-            fitted, digest = self._fit(*stage, fitted, data, before)
-            before = (digest,)
+            fitted = self._fit(f"{name}_{part}", problem, schedule, kinds, fitted, data)
         (learned,) = fitted.encoders
         learned = replace(learned, soil=learned.soil or params.encoders[_PAIR[name]].soil)
         params = replace(params, **{name: getattr(fitted, name)})
-        return _with_pair(params, name, learned), digest
+        return _with_pair(params, name, learned)
 
-    def _encoders(
-        self, name: Specialist, params: VertiWMParams
-    ) -> tuple[VertiWMParams, tuple[str, ...]]:
-        """The parameters with the encoders of a specialist, and the digests of these stages."""
+    def _encoders(self, name: Specialist, params: VertiWMParams) -> VertiWMParams:
+        """The parameters with the encoders of a specialist, and NeSAM's soil predictor, fitted."""
         kinds, patches = getattr(self.config, name).learns_from, self.config.patches
-        places = cache(lambda: autoencoders.PatchData.of(patches, *self._drives(kinds)))
+        places = self._data(autoencoders.PatchData.of, patches, kinds)
         seeing = "transformer" if self.config.model.encoders == "shared" else name
         schedule = getattr(self.config, seeing).autoencoders
         problem = autoencoders.AutoencoderProblem(patches)
-        pair = problem.init_params(self._key(seeing))
         stage = f"{seeing}_autoencoders", problem, schedule, kinds
-        pair, digest = self._fit(*stage, pair, places)
-        digests = (digest,)
+        pair = self._fit(*stage, problem.init_params(self._key(seeing)), places)
         found = replace(params.encoders[_PAIR[name]], **autoencoders.encoders(pair))
         if name == "nesam":
             looks = {"semantic": found.semantic, "soil": found.soil}
             stage = f"{name}_soil", autoencoders.SoilProblem(patches), self.config.soil, kinds
-            looks, digest = self._fit(*stage, looks, places, digests)
-            digests, found = (*digests, digest), replace(found, soil=looks["soil"])
-        return _with_pair(params, name, found), digests
+            found = replace(found, soil=self._fit(*stage, looks, places)["soil"])
+        return _with_pair(params, name, found)
 
-    def gate(self, params: VertiWMParams, before: Sequence[str]) -> VertiWMParams:
-        """The gates between two specialists, whose digests are given."""
+    def gate(self, params: VertiWMParams, before: tuple[str, ...]) -> VertiWMParams:
+        """The parameters with the gates fitted; before: the digests of both specialists."""
         config, soil = self.config.gate, params.encoders[-1].soil
         learned = config.rollouts.trainable
         latents = not learned or any(name.startswith("encoders") for name in learned)
@@ -254,14 +248,14 @@ class _Pipeline:
             params = calibration.gate_constants(verti_wm, params, *sample)
         objective = RolloutLoss(verti_wm, self.config.loss, attrgetter("coefficients"))
         problem = WindowProblem(verti_wm, objective, self.config.windows)
-        data = self._windows(config.learns_from)
+        data = self._data(WindowData.of, self.config.windows, config.learns_from)
         schedule = problem, config.rollouts, config.learns_from
         fitted: list[VertiWMParams] = []
         assert params.gate is not None
         for number in range(len(params.gate)):
             alone = replace(params, gate=params.gate.only(number))
-            name = f"gate_{number}" if number else "gate"
-            fitted.append(self._fit(name, *schedule, alone, data, before)[0])
+            name, self.before = f"gate_{number}" if number else "gate", before
+            fitted.append(self._fit(name, *schedule, alone, data))
         gates = [each.gate for each in fitted if each.gate is not None]
         return with_soil(replace(fitted[0], gate=gates[0].beside(*gates[1:])), soil)
 
@@ -277,28 +271,22 @@ class _Pipeline:
         kinds: Sequence[Kind],
         params: Params,
         data: Callable[[], Any],
-        before: Sequence[str] = (),
-    ) -> tuple[Any, str]:
-        """The fitted parameters of a stage, and what later ones know its inputs by."""
+    ) -> Any:
+        """The fitted parameters of a stage, on which the next one builds."""
         files = [file for folder in self._folders(KINDS) for file in sorted(folder.glob("*.npz"))]
         drives = tuple((file.name, file.stat().st_size) for file in files)
         key = self._key(name)
         seed = tuple(jax.random.key_data(key).tolist())
-        inputs = Inputs(problem, config, seed, tuple(kinds), drives, tuple(before))
-        fitted = stages.fit(self.run, name, inputs, params, data, key, self.reuse)
-        return fitted, inputs.digest
+        inputs = Inputs(problem, config, seed, tuple(kinds), drives, self.before)
+        self.before = (inputs.digest,)
+        return stages.fit(self.run, name, inputs, params, data, key, self.reuse)
 
     def _key(self, name: str) -> jax.Array:
         return jax.random.fold_in(self.key, zlib.crc32(name.encode()))
 
-    def _drives(
-        self, kinds: Sequence[Kind]
-    ) -> tuple[tuple[Drives, TerrainMap], tuple[Drives, TerrainMap]]:
-        """Drives to learn from and to validate on."""
-        return self.load(kinds, "train"), self.load(kinds, "validation")
-
-    def _windows(self, kinds: Sequence[Kind]) -> Callable[[], WindowData]:
-        return cache(lambda: WindowData.of(self.config.windows, *self._drives(kinds)))
+    def _data(self, of: Any, config: Any, kinds: Sequence[Kind]) -> Callable[[], Any]:
+        """What is made once of drives to learn from and to validate on, if it is asked for."""
+        return cache(lambda: of(config, self.load(kinds, "train"), self.load(kinds, "validation")))
 
     def load(self, kinds: Sequence[Kind], split: Split) -> tuple[Drives, TerrainMap]:
         """Drives of these kinds in all folders, and of folders that are not divided into kinds."""
