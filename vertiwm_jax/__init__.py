@@ -1,8 +1,7 @@
 """Fast, differentiable world models for off-road reinforcement learning, in JAX."""
 
-from typing import TYPE_CHECKING
-
-from vertiwm_jax._lazy import lazy
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vertiwm_jax.dynamics import Dynamics as Dynamics
@@ -56,7 +55,13 @@ _PUBLIC = {
     "rollout": "dynamics",
 }
 __all__ = [*_PUBLIC]  # pyright: ignore[reportUnsupportedDunderAll]
-__getattr__ = lazy(__name__, _PUBLIC)
+
+
+def __getattr__(name: str) -> Any:
+    """Imports what is public when it is used (PEP 562)."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -135,7 +135,9 @@ def with_three_cores(program: str) -> subprocess.CompletedProcess[str]:
     ],
 )
 def test_commands_use_all_cores_and_scripts_what_they_ask_for(before, expected):
-    found = with_three_cores(f"{before}\nimport vertiwm_jax.ppo, jax\nprint(jax.device_count())\n")
+    found = with_three_cores(
+        f"{before}\nimport vertiwm_jax.rl.ppo, jax\nprint(jax.device_count())\n"
+    )
     assert int(found.stdout) == expected
 
 
@@ -152,7 +154,7 @@ assert (gc.get_threshold(), dict(os.environ)) == before
 
 
 def test_to_ask_for_all_cores_too_late_is_an_error_that_says_what_to_do():
-    program = "import vertiwm_jax.ppo\nfrom vertiwm_jax import machine\nmachine.use_cores()\n"
+    program = "import vertiwm_jax.rl.ppo\nfrom vertiwm_jax import machine\nmachine.use_cores()\n"
     found = with_three_cores(program)
     assert found.returncode == 1
     assert "JAX has started with 1 CPU device(s) of 3. Call it before" in found.stderr
