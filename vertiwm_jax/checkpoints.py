@@ -88,15 +88,6 @@ def load(path: str | Path, like: State) -> State:
     return hosts.with_keys(like, jax.tree.unflatten(jax.tree.structure(like), leaves))
 
 
-def names(path: str | Path) -> set[str]:
-    """Of the leaves in a checkpoint, dotted; none where it cannot be read."""
-    try:
-        with _quiet(), _alone():
-            return set(ocp.metadata(str(Path(path).absolute())).metadata)
-    except (OSError, ValueError, KeyError):
-        return set()
-
-
 def _alone() -> ocp.Context:
     """In which this host reads by itself."""
     this = jax.process_index()

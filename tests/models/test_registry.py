@@ -126,36 +126,3 @@ def test_what_was_saved_is_loaded_by_its_parts(tmp_path, encoders, terrain):
     else:
         with pytest.raises(CheckpointError, match="expected vertiwm, found nesam and transformer"):
             load_model("vertiwm", tmp_path)
-
-
-def _as_before(params):
-    """Parameters as version 0.1 wrote them."""
-    own, nesam = params.transformer, params.nesam
-    first, last = params.encoders[0], params.encoders[-1]
-    pair = {"elevation": first.elevation, "semantic": first.semantic}
-    network = {"params": {**own.network["params"], "reduce": first.reduce}}
-    return {
-        "transformer": {
-            "network": network,
-            "encoders": pair,
-            "normalisation": own.normalization,
-        },
-        "nesam": {
-            "network": nesam.network,
-            "encoders": {"elevation": last.elevation, "semantic": last.semantic},
-            "soil": last.soil,
-            "simulator": nesam.physics(params.vehicle),
-            "normalisation": nesam.normalization,
-            "correction_scale": nesam.correction_scale,
-            "response": nesam.response,
-        },
-        "gate": params.gate,
-    }
-
-
-@pytest.mark.parametrize("encoders", ["own", "shared"])
-def test_models_of_before_are_read(tmp_path, encoders):
-    config = ModelConfig(encoders=encoders)
-    params = config.init_params(jax.random.key(0), load_model("builtin")[1])
-    files.save(tmp_path, config, _as_before(params))
-    chex.assert_trees_all_equal(files.load(tmp_path)[1], jax.tree.map(jnp.asarray, params))
