@@ -243,8 +243,8 @@ def fit(name: str, **changes: Any) -> Numbers:
             for file in (Path(kind, f"{kind}_001.npz"), Path("maps", f"{kind}_001.npz")):
                 Path(folder, file.parent).mkdir(exist_ok=True)
                 Path(folder, file).symlink_to(OPEN_DRIVES / file)
-        run, key = Run(Path(folder), None), jax.random.key(0)
-        params = pipeline.fit(config, [Path(folder)], key, run, start=start)
+        config = replace(config, data=(Path(folder),))
+        params = pipeline.fit(config, Run(Path(folder), None), start)
     if start is None and "gate" in config.model.parts:
         constants = vars(params.nesam.normalization) | {
             "correction_scale": params.nesam.correction_scale,

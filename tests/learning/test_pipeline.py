@@ -1,7 +1,6 @@
 """Whose physics is fitted; what is fitted, and in which order, is tested with the command."""
 
 import chex
-import jax
 import pytest
 from learning import recordings
 
@@ -27,8 +26,8 @@ def test_a_fit_that_goes_on_keeps_its_vehicle_unless_told(tmp_path, monkeypatch)
     recordings.write(tmp_path)
     start, run = files.load(files.PRETRAINED)[1], Run(tmp_path, None)
     for name, driven in ((None, load_vehicle()), ("rover", vehicle.load("rover").vehicle)):
-        config = PipelineConfig(model=NESAM, vehicle=name)
-        fitted = pipeline.fit(config, [tmp_path], jax.random.key(0), run, start=start)
+        config = PipelineConfig(model=NESAM, vehicle=name, data=(tmp_path,))
+        fitted = pipeline.fit(config, run, start)
         chex.assert_trees_all_equal(fitted.vehicle, driven)
         chex.assert_trees_all_equal(fitted.nesam.network, start.nesam.network)
     # A stage of one is not taken over for the other.
@@ -53,8 +52,8 @@ def test_stages_from_nothing_are_of_their_vehicle(tmp_path, monkeypatch):
     recordings.write(tmp_path)
     stage = {}
     for name in (None, "rover"):
-        config, run = PipelineConfig(model=NESAM, vehicle=name), Run(tmp_path, None)
-        pipeline.fit(config, [tmp_path], jax.random.key(0), run)
+        config = PipelineConfig(model=NESAM, vehicle=name, data=(tmp_path,))
+        pipeline.fit(config, Run(tmp_path, None))
         stage[name] = dict(told)
     assert "mass=3.5" in stage["rover"]["nesam_single_steps"]
     assert stage[None]["nesam_single_steps"] != stage["rover"]["nesam_single_steps"]

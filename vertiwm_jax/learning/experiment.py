@@ -6,8 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from vertiwm_jax import config as configuration
 from vertiwm_jax.config import ConfigError, settings
 from vertiwm_jax.dynamics import Dynamics, Params
@@ -27,20 +25,12 @@ _log = logging.getLogger(__name__)
 class FitConfig(PipelineConfig):
     """Fit Verti-WM to recorded drives: autoencoders, both specialists, the gate."""
 
-    data: tuple[Path, ...] = (Path("data/open"),)
-    """Folders of drives, or of such folders named rigid, deformable and mixed."""
-    add: tuple[Path, ...] = ()
-    """Folders of more drives beside those, such as a policy has driven (`collect --policy`)."""
     name: str = "fit"
     """What the name of the run folder begins with; the date follows."""
-    seed: int = 0
-    """Decides everything that is random."""
     runs: Path = Path("runs")
     """Folder in which the folder of this run is made."""
     resume: Path | None = None
     """Folder of an earlier run to go on with; stages that have ended are not repeated."""
-    reuse: tuple[Path, ...] = ()
-    """Folders of earlier runs, whose stages are taken over where their inputs are the same."""
     start: Path | None = None
     """Folder of a fitted model to go on from, or `pretrained`: it is fitted further by open-loop
     predictions; its encoders and constants stay. It may have fewer gates than `model.gates`."""
@@ -60,9 +50,7 @@ def run(config: FitConfig) -> Path:
     start = _start(config)
     with Run.begin(config, config.name, project=config.wandb) as run:
         _log.info("run folder %s", run.folder)
-        key = jax.random.key(config.seed)
-        folders = config.data + config.add
-        params = pipeline.fit(config, folders, key, run, config.reuse, start)
+        params = pipeline.fit(config, run, start)
         files.save(run.folder / "model", config.model, params)
     return run.folder
 

@@ -77,8 +77,16 @@ class GateConfig:
 
 @settings
 class PipelineConfig:
-    """What world model is fitted, and how."""
+    """What world model is fitted, to what drives, and how."""
 
+    data: tuple[Path, ...] = (Path("data/open"),)
+    """Folders of drives, or of such folders named rigid, deformable and mixed."""
+    add: tuple[Path, ...] = ()
+    """Folders of more drives beside those, such as a policy has driven (`collect --policy`)."""
+    reuse: tuple[Path, ...] = ()
+    """Folders of earlier runs, whose stages are taken over where their inputs are the same."""
+    seed: int = 0
+    """Decides everything that is random."""
     model: ModelConfig = ModelConfig()
     """What is fitted."""
     vehicle: str | None = None
@@ -118,22 +126,12 @@ class PipelineConfig:
             )
 
 
-def fit(
-    config: PipelineConfig,
-    folders: Sequence[Path],
-    key: jax.Array,
-    run: Run,
-    reuse: Sequence[Path] = (),
-    start: VertiWMParams | None = None,
-) -> VertiWMParams:
+def fit(config: PipelineConfig, run: Run, start: VertiWMParams | None = None) -> VertiWMParams:
     """Runs all stages of the configured parts.
 
     Args:
         config: what is fitted, and how.
-        folders: of drives, or of folders of drives named like `KINDS`.
-        key: of all that is random.
         run: in whose folder the stages are.
-        reuse: folders of other runs, whose stages are taken over where their inputs are the same.
         start: parameters to go on from, by open-loop predictions alone.
 
     Returns:
@@ -147,7 +145,7 @@ def fit(
     if start is not None:
         start = start if driven is None else replace(start, vehicle=jax.device_put(driven.vehicle))
         begun = (stages.digest(start),)
-    pipeline = _Pipeline(config, folders, key, run, reuse, begun, from_nothing=start is None)
+    pipeline, key = _Pipeline(config, run, begun, start is None), jax.random.key(config.seed)
     if start is None:
         constants = calibration.normalization(pipeline.load(KINDS, "train")[0])
         physics = chrono_like(driven.vehicle if driven else load_vehicle())
@@ -171,10 +169,7 @@ class _Pipeline:
     """
 
     config: PipelineConfig
-    folders: Sequence[Path]
-    key: jax.Array
     run: Run
-    reuse: Sequence[Path]
     begun: tuple[str, ...]
     from_nothing: bool
     before: tuple[str, ...] = ()
@@ -279,10 +274,10 @@ class _Pipeline:
         seed = tuple(jax.random.key_data(key).tolist())
         inputs = Inputs(problem, config, seed, tuple(kinds), drives, self.before)
         self.before = (inputs.digest,)
-        return stages.fit(self.run, name, inputs, params, data, key, self.reuse)
+        return stages.fit(self.run, name, inputs, params, data, key, self.config.reuse)
 
     def _key(self, name: str) -> jax.Array:
-        return jax.random.fold_in(self.key, zlib.crc32(name.encode()))
+        return jax.random.fold_in(jax.random.key(self.config.seed), zlib.crc32(name.encode()))
 
     def _data(self, of: Any, config: Any, kinds: Sequence[Kind]) -> Callable[[], Any]:
         """What is made once of drives to learn from and to validate on, if it is asked for."""
@@ -297,13 +292,13 @@ class _Pipeline:
         return self.loaded[key]
 
     def _folders(self, kinds: Sequence[Kind]) -> list[Path]:
-        chosen: list[Path] = []
-        for folder in self.folders:
+        chosen, given = list[Path](), self.config.data + self.config.add
+        for folder in given:
             chosen += [folder] if any(folder.glob("*.npz")) else []
             chosen += [folder / kind for kind in kinds if (folder / kind).is_dir()]
         if not chosen:
             raise DataError(
-                f"{', '.join(map(str, self.folders))}: expected files of drives, or folders of "
+                f"{', '.join(map(str, given))}: expected files of drives, or folders of "
                 f"them named {' or '.join(kinds)}, found neither"
             )
         return chosen
