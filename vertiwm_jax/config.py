@@ -112,7 +112,7 @@ def _parts(kind: Any) -> Iterator[Any]:
 
 
 def default_config(name: str) -> Path:
-    """The YAML file `name` (without ending; `folder/name` in a folder) that comes along.
+    """The YAML file `name` (without ending; `folder/name` in a folder) that is shipped.
 
     An installed wheel carries the files in the package, a checkout beside it. An unknown name
     raises `ConfigError`.
@@ -127,7 +127,7 @@ def default_config(name: str) -> Path:
 
 
 def find(path: str | Path) -> Path:
-    """The YAML file at `path`, or the one of that name that comes along: `ppo_small`.
+    """The YAML file at `path`, or the shipped one of that name: `ppo_small`.
 
     An unknown name raises `ConfigError`.
     """

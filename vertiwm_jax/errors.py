@@ -41,9 +41,4 @@ def refusing(refusal: Callable[[str], UserError]) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        raise refusal(one_line(error)) from None
-
-
-def one_line(error: Exception) -> str:
-    """What an error of another package says, and its kind, on one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split())
+        raise refusal(" ".join(f"{type(error).__name__}: {error}".split())) from None

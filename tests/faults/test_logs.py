@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from doors import door, refusal
-from faults.border import fault
 from importers.bags import Bag
 from importers.logged import SETTINGS, logged, terrain
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -90,7 +89,6 @@ def test_blank_lines_are_passed_over(folder, seen, tmp_path, ending):
     np.testing.assert_array_equal(found, expected)
 
 
-@fault(SystemExit, "a drive of one pose refuses the log")
 def test_a_drive_of_one_pose_is_left_out(folder, seen, tmp_path, capsys):
     one = {name: column[:1] for name, column in columns(seen).items()}
     log = tmp_path / "log.csv"
@@ -122,7 +120,6 @@ BAD_ROWS = {
 
 
 @pytest.mark.parametrize("case", BAD_ROWS)
-@fault(SystemExit, "a bad row refuses the log")
 def test_a_bad_row_is_left_out_and_said(folder, seen, tmp_path, capsys, case):
     whole = text({"dawn": columns(seen), "dusk": columns(seen)})
     rows = list(csv.DictReader(whole.splitlines()))
@@ -143,7 +140,6 @@ def test_a_bad_row_is_left_out_and_said(folder, seen, tmp_path, capsys, case):
     assert str(log) in said and "dusk" in said and str(time) in said
 
 
-@fault(SystemExit, "a last line that is cut off refuses the log")
 def test_a_last_line_that_is_cut_off_is_left_out_and_said(folder, seen, tmp_path, capsys):
     log = tmp_path / "log.csv"
     log.write_text(text({"dawn": columns(seen)})[:-40])
@@ -200,7 +196,6 @@ WRONG_ATTITUDES = {
 
 
 @pytest.mark.parametrize("case", WRONG_ATTITUDES)
-@fault(pytest.fail.Exception, "velocities that come from the same attitudes cannot tell them wrong")
 def test_attitudes_of_another_unit_or_frame_are_refused(folder, tmp_path, case):
     table, changed = WRONG_ATTITUDES[case]
     (tmp_path / "log.csv").write_text(text({"dawn": changed(ahead())}))
@@ -209,7 +204,6 @@ def test_attitudes_of_another_unit_or_frame_are_refused(folder, tmp_path, case):
 
 
 @pytest.mark.parametrize("speed", [0.001, -0.001])
-@fault(AssertionError, "a yaw rate at next to no speed becomes a right angle of the wheels")
 def test_a_vehicle_that_hardly_moves_does_not_tell_its_steering(speed):
     angles = rosbag.steering(np.array([2.0, speed]), np.array([0.5, 0.5]), wheelbase=2.0)
     assert np.abs(angles).max() < 0.8  # No car steers farther.

@@ -24,9 +24,15 @@ def states(time: np.ndarray) -> np.ndarray:
     position = np.stack([20 * np.sin(0.15 * t), 8 * np.sin(0.3 * t), 0.5 * np.cos(0.4 * t)], 1)
     moved = np.stack([3 * np.cos(0.15 * t), 2.4 * np.cos(0.3 * t), -0.2 * np.sin(0.4 * t)], 1)
     roll, pitch = 0.15 * np.sin(0.8 * t), 0.2 * np.sin(0.6 * t + 1)
-    yaw = 0.3 * t + 0.4 * np.sin(0.5 * t)
+    # Faces where it moves.
+    (along_x, along_y, _), pushed_x, pushed_y = (
+        moved.T,
+        -0.45 * np.sin(0.15 * t),
+        -0.72 * np.sin(0.3 * t),
+    )
+    yaw = np.arctan2(along_y, along_x)
     roll_rate, pitch_rate = 0.12 * np.cos(0.8 * t), 0.12 * np.cos(0.6 * t + 1)
-    yaw_rate = 0.3 + 0.2 * np.cos(0.5 * t)
+    yaw_rate = (along_x * pushed_y - along_y * pushed_x) / (along_x**2 + along_y**2)
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
     world_from_body = np.array(
         [

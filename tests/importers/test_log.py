@@ -1,5 +1,6 @@
 """Units, frames and what is refused of a log."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +27,11 @@ def arrays():
     }
 
 
+def read(arrays, settings=SETTINGS):
+    (log,) = converted(Log(**arrays), "a.csv", settings)
+    return log
+
+
 def assert_same(found, expected):
     for name in ("time", "position", "velocity", "angular_velocity", "command_time", "command"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9)
@@ -33,7 +39,7 @@ def assert_same(found, expected):
 
 
 def test_roll_pitch_yaw_are_rz_ry_rx(arrays):
-    found = converted(Log(**arrays), "a", SETTINGS)
+    found = read(arrays)
     c, s = np.cos(arrays["attitude"].T), np.sin(arrays["attitude"].T)
     for k in range(len(arrays["time"])):
         x = np.array([[1, 0, 0], [0, c[0, k], -s[0, k]], [0, s[0, k], c[0, k]]])
@@ -41,11 +47,11 @@ def test_roll_pitch_yaw_are_rz_ry_rx(arrays):
         z = np.array([[c[2, k], -s[2, k], 0], [s[2, k], c[2, k], 0], [0, 0, 1]])
         np.testing.assert_allclose(found.rotation[k].as_matrix(), z @ y @ x, atol=1e-12)
     arrays["attitude"] = found.rotation.as_quat()
-    assert_same(converted(Log(**arrays), "a", SETTINGS), found)
+    assert_same(read(arrays), found)
 
 
 def test_units_are_converted(arrays):
-    expected = converted(Log(**arrays), "a", SETTINGS)
+    expected = read(arrays)
     units = Units(1e-3, 0.01, np.pi / 180, 1 / 3.6, 5.0, -0.5)
     other = {
         "time": arrays["time"] * 1e3,
@@ -56,13 +62,13 @@ def test_units_are_converted(arrays):
         "command_time": arrays["command_time"] * 1e3,
         "command": arrays["command"] / [5, -0.5],
     }
-    assert_same(converted(Log(**other), "a", replace(SETTINGS, units=units)), expected)
+    assert_same(read(other, replace(SETTINGS, units=units)), expected)
 
 
 @pytest.mark.parametrize("as_quaternion", [False, True])
 def test_frames_are_converted(arrays, as_quaternion):
     """North-east-down, with velocities in the world, and a world that begins elsewhere."""
-    expected = converted(Log(**arrays), "a", SETTINGS)
+    expected = read(arrays)
     flip, origin = np.diag([1.0, -1, -1]), np.array([500.0, -300, 20])
     down = Rotation.from_matrix(flip @ expected.rotation.as_matrix() @ flip)
     frames = Frames("z_down", "world", "world", tuple(origin.tolist()))
@@ -72,35 +78,75 @@ def test_frames_are_converted(arrays, as_quaternion):
         "velocity": down.apply(arrays["velocity"] @ flip),
         "angular_velocity": down.apply(arrays["angular_velocity"] @ flip),
     }
-    assert_same(converted(Log(**other), "a", replace(SETTINGS, frames=frames)), expected)
+    assert_same(read(other, replace(SETTINGS, frames=frames)), expected)
 
 
-@pytest.mark.parametrize(
-    ("field", "sample", "value", "message"),
-    [
-        ("time", 5, np.nan, "a.csv: time: expected finite numbers, found nan in sample 5"),
-        ("time", 5, 0.0, r"a.csv: time: expected stamps that increase, found 0.0 in sample 5 "),
-        ("command_time", 5, 0.0, "a.csv: time of commands: expected stamps that increase"),
-        ("position", 7, np.inf, "a.csv: position: expected finite numbers, found .* in sample 7"),
-        ("velocity", 0, np.nan, "a.csv: velocity: expected finite numbers"),
-        ("command", 2, np.nan, "a.csv: command: expected finite numbers"),
-        ("attitude", 3, 0.0, "a.csv: attitude: expected quaternions of length 1, found 0.0 in sam"),
-    ],
-)
-def test_what_cannot_be_used_is_named(arrays, field, sample, value, message):
+WRONG = {
+    "time": (np.nan, "time: expected finite numbers, found nan"),
+    "command_time": (np.nan, "time of commands: expected finite numbers"),
+    "position": (np.inf, "position: expected finite numbers, found .*inf"),
+    "velocity": (np.nan, "velocity: expected finite numbers"),
+    "command": (np.nan, "command: expected finite numbers"),
+    "attitude": (0.0, "attitude: expected quaternions of length 1, found 0.0"),
+}
+
+
+def with_wrong(arrays, field, samples):
     quaternions = Rotation.from_euler("ZYX", arrays["attitude"][:, ::-1]).as_quat()
     arrays = {name: array.copy() for name, array in arrays.items()} | {"attitude": quaternions}
-    arrays[field][sample] = value
-    with pytest.raises(DataError, match=message) as error:
-        converted(Log(**arrays), "a.csv", SETTINGS)
+    arrays[field][samples] = WRONG[field][0]
+    return arrays
+
+
+@pytest.mark.parametrize("field", WRONG)
+def test_samples_that_cannot_be_used_are_left_out_and_said(arrays, field):
+    log = read(with_wrong(arrays, field, [5, 9]))
+    of_commands = field.startswith("command")
+    time, whole = (log.command_time, log.time) if of_commands else (log.time, log.command_time)
+    np.testing.assert_allclose(time, np.delete(arrays["time"], [5, 9]))
+    np.testing.assert_allclose(whole, arrays["time"])
+    (remark,) = log.remarks
+    assert re.match(f"a.csv: {WRONG[field][1]}", remark)
+    assert "in sample 5 among 2 such" in remark and log.remarks[remark] == 2
+    assert remark.endswith(f"{arrays['time'][4]:.10g} and {arrays['time'][6]:.10g}: left out")
+
+
+@pytest.mark.parametrize("field", WRONG)
+def test_a_log_of_which_most_cannot_be_used_is_refused(arrays, field):
+    wrong = with_wrong(arrays, field, np.s_[3:])
+    with pytest.raises(DataError, match=f"a.csv: {WRONG[field][1]}.* in sample 3 ") as error:
+        read(wrong)
     assert "\n" not in str(error.value)
 
 
-def test_stamps_that_repeat_are_refused(arrays):
+@pytest.mark.parametrize("field", ["time", "command_time"])
+@pytest.mark.parametrize("stamp", [7, 3, 0])
+def test_a_stamp_that_does_not_increase_is_left_out_and_said(arrays, field, stamp):
+    arrays[field] = arrays[field].copy()
+    arrays[field][8] = arrays[field][stamp]
+    log = read(arrays)
+    np.testing.assert_allclose(getattr(log, field), np.delete(arrays[field], 8))
+    (remark,) = log.remarks
+    assert "expected stamps that increase" in remark
+
+
+def test_two_stamps_that_are_swapped_cost_one_sample(arrays):
     arrays["time"] = arrays["time"].copy()
-    arrays["time"][8] = arrays["time"][7]
-    with pytest.raises(DataError, match="expected stamps that increase"):
-        converted(Log(**arrays), "a", SETTINGS)
+    arrays["time"][[8, 9]] = arrays["time"][[9, 8]]
+    log = read(arrays)
+    np.testing.assert_allclose(log.time, np.delete(arrays["time"], 9))
+
+
+def test_a_clock_that_is_set_back_cuts_the_log(arrays):
+    twice = {name: np.concatenate([array, array]) for name, array in arrays.items()}
+    logs = converted(Log(**twice), "a.csv", SETTINGS)
+    for log in logs:
+        assert_same(log, read(arrays))
+    assert len(logs) == 2
+    said = f"is set back from {arrays['time'][-1]:.10g} to {arrays['time'][0]:.10g}"
+    assert [said in remark for remark in logs[0].remarks] == [True, True]
+    with pytest.raises(DataError, match=r"expected clocks .* set back together, found 1 and 0"):
+        converted(Log(**twice | {k: arrays[k] for k in ("command_time", "command")}), "a", SETTINGS)
 
 
 def test_settings_of_no_vehicle():

@@ -29,7 +29,8 @@ def build(seen: Logged, rows=slice(None), with_velocities: bool = False, setting
         command=seen.command[rows],
         **velocities,
     )
-    return converted(found, "a.csv", settings)
+    (log,) = converted(found, "a.csv", settings)
+    return log
 
 
 def moments(seen: Logged, steps: int, first: int = 0) -> np.ndarray:
@@ -106,7 +107,7 @@ def test_drives_need_poses_and_commands():
         command_time=seen.time[late],
         command=seen.command[late],
     )
-    found = converted(found, "a.bag", SETTINGS)
+    (found,) = converted(found, "a.bag", SETTINGS)
     (drive,) = resample(found, WHOLE, ORIGIN)[0]
     start = seen.time[late][0]
     at = start + 0.1 * np.arange(len(drive.control) + 1)

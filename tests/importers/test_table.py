@@ -98,6 +98,24 @@ def test_drives_come_in_the_order_in_which_they_begin(seen, tmp_path):
     assert [log.time[0] for log in logs] == [99.5, pytest.approx(seen.time[0])]
 
 
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda line: line[:4], "line 7: expected 9 values as in the head, found 4: left out 1 "),
+        (lambda line: [*line, "5"], "line 7: expected 9 values as in the head, found 10: left out"),
+        (lambda line: ["north", *line[1:]], "time: expected finite numbers, found nan"),
+        (lambda line: [*line[:3], "", *line[4:]], "position: expected finite numbers, found ["),
+    ],
+)
+def test_a_bad_line_is_left_out_and_said(seen, tmp_path, damage, said):
+    lines = rows(seen)
+    lines[5] = damage(lines[5])
+    (log,) = table.read(write(tmp_path / "a.csv", NAMES, lines), CSV)
+    np.testing.assert_allclose(log.time, np.delete(seen.time, 5), atol=1e-6)
+    remark, *_ = log.remarks  # A row without a time is neither a pose nor a command.
+    assert remark.startswith(f"{tmp_path / 'a.csv'}: {said}")
+
+
 def test_files_that_cannot_be_read_are_named(seen, tmp_path):
     path, lines = tmp_path / "a.csv", rows(seen)
 
@@ -109,13 +127,11 @@ def test_files_that_cannot_be_read_are_named(seen, tmp_path):
 
     write(path, NAMES[:-1], lines)
     assert message() == f"expected columns steer, found only {', '.join(NAMES[:-1])}"
-    write(path, NAMES, [*lines, lines[0][:4]])
-    assert message() == f"line {len(lines) + 2}: expected 9 values as in the head, found 4"
-    write(path, NAMES, [[*lines[0], "5"], *lines[1:]])  # such as of a comma within a number
-    assert message() == "line 2: expected 9 values as in the head, found 10"
-    write(path, NAMES, [["north", *lines[0][1:]], *lines[1:]])
+    write(path, NAMES, [[*line, "5"] for line in lines])  # such as of a comma within a number
+    assert message().startswith("line 2: expected 9 values as in the head, found 10; ")
+    write(path, NAMES, [["north", *line[1:]] for line in lines])
     assert message().startswith("t: expected numbers: could not convert string to float")
-    write(path, NAMES, [[*lines[0][:3], "nan", *lines[0][4:]], *lines[1:]])
+    write(path, NAMES, [[*line[:3], "nan", *line[4:]] for line in lines])
     assert message().startswith("position: expected finite numbers, found [")
     write(path, NAMES, [])
     assert message() == "expected rows below the head, found none"

@@ -14,6 +14,7 @@ from vertiwm_jax.terrain.classes import STANDARD
 from vertiwm_jax.terrain.map import TerrainMap
 
 _KIND = "grid_map_msgs/msg/GridMap"
+_MOST_CELLS = 10**8
 
 
 class Canvas:
@@ -26,10 +27,20 @@ class Canvas:
         self.values, self.origin, self.resolution = patch, origin, resolution
 
     def paint(self, patch: np.ndarray, origin: np.ndarray) -> None:
-        """`[L, I, J]` values, NaN where there are none, of which cell (0, 0) lies at `[2]` m."""
-        first = np.rint((origin - self.origin) / self.resolution).astype(int)
-        before = np.maximum(-first, 0)
-        after = np.maximum(first + patch.shape[1:] - self.values.shape[1:], 0)
+        """`[L, I, J]` values, NaN where there are none, of which cell (0, 0) lies at `[2]` m.
+
+        Raises `ValueError` where all patches together lie too far apart.
+        """
+        offset = np.rint((origin - self.origin) / self.resolution)
+        before = np.maximum(-offset, 0)
+        after = np.maximum(offset + patch.shape[1:] - self.values.shape[1:], 0)
+        size = before + self.values.shape[1:] + after
+        if not np.prod(size) <= _MOST_CELLS:
+            x, y = self.resolution * size / 1000
+            raise ValueError(
+                f"expected all maps within {_MOST_CELLS:,} cells, found {x:,.3f} km x {y:,.3f} km"
+            )
+        first, before, after = (x.astype(int) for x in (offset, before, after))
         if before.any() or after.any():
             margins = [(0, 0), *zip(before, after, strict=True)]
             self.values = np.pad(self.values, margins, constant_values=np.nan)
@@ -59,7 +70,10 @@ def terrain(
                     f"{name}: expected {canvas.resolution:g} m between cells as before, found "
                     f"{message.info.resolution:g}"
                 )
-            canvas.paint(patch, origin)
+            try:
+                canvas.paint(patch, origin)
+            except ValueError as error:
+                raise DataError(f"{name}: {error}") from None
     assert canvas is not None  # A topic without messages is refused.
     name = f"{paths[0]}: {wanted.topic}"
     known = np.isfinite(canvas.values[0])

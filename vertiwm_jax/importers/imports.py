@@ -61,10 +61,12 @@ def import_drives(
     readers = [_reader(source) for source in sources]
     with atomic.new_folder(output) as unfinished:
         terrain, said = _terrain(sources, settings_file, settings, map)
-        drives, rows = list[Drive](), list[Row]()
+        drives, rows, remarks = list[Drive](), list[Row](), list[str]()
         with Progress(len(sources), "logs") as progress:
             for source, read in zip(sources, readers, strict=True):
-                found, row = _import(source, read, settings, terrain)
+                logs = read(source, settings)
+                remarks += [remark for log in logs for remark in log.remarks]
+                found, row = _import(source, logs, settings, terrain)
                 drives += found
                 rows.append(row)
                 progress.advance(1, source.name)
@@ -80,7 +82,7 @@ def import_drives(
         for number, first in enumerate(range(0, len(drives), PER_FILE)):
             some = _arrays(drives[first : first + PER_FILE])
             schema.write(unfinished / f"drives_{number:03d}.npz", some, meta, wheels)
-    remarks = _remarks(drives, terrain, settings.vehicle.scale)
+    remarks += _remarks(drives, terrain, settings.vehicle.scale)
     return "\n".join([markdown(rows), "", *said, *remarks])
 
 
@@ -113,13 +115,13 @@ def _terrain(
 
 
 def _import(
-    source: Path, read: Reader, settings: ImportSettings, terrain: TerrainMap
+    source: Path, logs: Sequence[Log], settings: ImportSettings, terrain: TerrainMap
 ) -> tuple[list[Drive], Row]:
     """The drives of a source that are on the map, and its row of the table.
 
     Raises `DataError` unless all drives are of the schema, and move where they say.
     """
-    logs, scale = read(source, settings), settings.vehicle.scale
+    scale = settings.vehicle.scale
     drives, left_out = list[Drive](), Counter[str]()
     point = scale * np.asarray(settings.vehicle.logged_point)
     for log in logs:
@@ -128,24 +130,31 @@ def _import(
         left_out += short
     if drives:
         schema.check(source, _arrays(drives))
-        way_off, _ = resampling.directions(drives)
+        way_off, axis_off = resampling.directions(drives)
         if way_off > LARGEST_ANGLE:
             raise DataError(
                 f"{source}: velocity: expected to point where the positions go, found "
                 f"{np.degrees(way_off):.0f} degrees off in half of the steps; see `frames` of the "
                 "settings, and the order of quaternions"
             )
+        if logs[0].velocity is None and axis_off > LARGEST_ANGLE:
+            raise DataError(
+                f"{source}: attitude: expected a vehicle that moves along its x axis, found "
+                f"{np.degrees(axis_off):.0f} degrees off in half of the steps; see `units.angle` "
+                "and `frames` of the settings, and the order of quaternions"
+            )
     low, high = map(np.asarray, terrain.extent)
     paths = (drive.state[:, :2] for drive in drives)
     inside = [((xy >= low) & (xy <= high)).all() for xy in paths]
     kept = [drive for drive, stays in zip(drives, inside, strict=True) if stays]
+    left_out["samples"] += sum(count for log in logs for count in log.remarks.values())
     left_out["off the map"] += len(drives) - len(kept)
     reasons = ", ".join(f"{count} {why}" for why, count in left_out.items() if count)
-    apart = np.median(np.concatenate([np.diff(log.time) for log in logs]))
+    apart = np.concatenate([np.diff(log.time) for log in logs])
     derived = {"velocity": logs[0].velocity, "angular velocity": logs[0].angular_velocity}
     return kept, {
         "log": str(source),
-        "poses a second": f"{scale**0.5 / apart:.1f}",
+        "poses a second": f"{scale**0.5 / np.median(apart):.1f}" if len(apart) else "-",
         "from poses": ", ".join(name for name, logged in derived.items() if logged is None) or "-",
         "drives": len(kept),
         "steps": f"{sum(len(drive.control) for drive in kept):,}",

@@ -1,14 +1,19 @@
 """A logged drive, checked and converted to SI units, full size and the axes of this project."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.learning.schema import DataError
+
+Some = slice | np.ndarray
+_OF_POSES = "position", "attitude", "velocity", "angular_velocity"
 
 
 @dataclass(frozen=True)
@@ -20,7 +25,8 @@ class Log:
     time: `[N]` s, increasing; position: `[N, 3]` p_world, m; attitude: of body to world, `[N, 3]`
     roll, pitch, yaw, rad, or `[N, 4]` quaternions x, y, z, w; command_time: `[M]` s, increasing;
     command: `[M, 2]` speed and front-wheel angle, m/s and rad; velocity: `[N, 3]` v_body, m/s, and
-    angular_velocity: `[N, 3]` omega_body, rad/s, None where they were not logged.
+    angular_velocity: `[N, 3]` omega_body, rad/s, None where they were not logged; remarks: what
+    was found and left out of the file, and how many samples.
     """
 
     time: np.ndarray
@@ -30,6 +36,7 @@ class Log:
     command: np.ndarray
     velocity: np.ndarray | None = None
     angular_velocity: np.ndarray | None = None
+    remarks: Mapping[str, int] = MappingProxyType({})
 
     @cached_property
     def rotation(self) -> Rotation:
@@ -38,32 +45,48 @@ class Log:
             return Rotation.from_quat(self.attitude)
         return Rotation.from_euler("ZYX", self.attitude[:, ::-1])
 
-    def part(self, poses: slice) -> "Log":
-        """The log with some of its poses, and all commands."""
-        names = ("time", "position", "attitude", "velocity", "angular_velocity")
-        logged = {name: getattr(self, name) for name in names}
-        return replace(self, **{k: x if x is None else x[poses] for k, x in logged.items()})
+    def part(self, poses: Some, commands: Some = slice(None)) -> "Log":
+        """The log with some of its poses and commands."""
+        chosen = dict.fromkeys(("time", *_OF_POSES), poses)
+        chosen |= dict.fromkeys(("command_time", "command"), commands)
+        logged = {k: (getattr(self, k), some) for k, some in chosen.items()}
+        return replace(self, **{k: x if x is None else x[some] for k, (x, some) in logged.items()})
 
 
-def converted(log: Log, name: str | Path, settings: ImportSettings) -> Log:
+def converted(
+    log: Log,
+    name: str | Path,
+    settings: ImportSettings,
+    remarks: Mapping[str, int] = MappingProxyType({}),
+) -> list[Log]:
     """The log in SI units, at full size and in the axes of this project.
 
-    log: in the units and frames of its file. Raises `DataError`, which calls it `name`, unless all
-    are finite, stamps increase, quaternions have length 1 and there are two poses.
+    Samples that cannot be used are left out: those that are not finite, quaternions whose length is
+    not 1, and stamps that do not follow those before. The log is cut where its clock is set back.
+
+    log: in the units and frames of its file, called `name`; remarks: what its reader left out.
+
+    Returns:
+        A log for each time that the clock was set back, and one more. Remarks of the first say what
+        was left out.
+
+    Raises:
+        DataError: there are no poses or commands, or more than half of them cannot be used.
     """
-    for field, array in vars(log).items():
-        if array is None:
-            continue
-        called = f"{name}: {'time of commands' if field == 'command_time' else field}"
-        if not len(array):
-            raise DataError(f"{called}: expected one value or more, found none")
-        wrong = ~np.isfinite(array.reshape(len(array), -1)).all(1)
-        _refuse(f"{called}: expected finite numbers", wrong, array)
-        if array.ndim == 1:
-            wrong = np.diff(array, prepend=-np.inf) <= 0
-            _refuse(f"{called}: expected stamps that increase", wrong, array)
-    if len(log.time) < 2:
-        raise DataError(f"{name}: time: expected two poses or more, found one")
+    said = dict(remarks)
+    gap = settings.resampling.gap / settings.units.time / settings.vehicle.scale**0.5
+    poses = _usable(name, log, ("time", *_OF_POSES), gap, said)
+    commands = _usable(name, log, ("command_time", "command"), gap, said)
+    if len(poses) != len(commands):
+        raise DataError(
+            f"{name}: time: expected clocks of poses and commands that are set back together, "
+            f"found {len(poses) - 1} and {len(commands) - 1} times"
+        )
+    logs = [_in_si(log.part(*both), settings) for both in zip(poses, commands, strict=True)]
+    return [replace(logs[0], remarks=said), *logs[1:]]
+
+
+def _in_si(log: Log, settings: ImportSettings) -> Log:
     units, frames = settings.units, settings.frames
     meter = settings.vehicle.scale
     second = meter**0.5  # Froude's similarity: gravity is the same at any size.
@@ -72,9 +95,6 @@ def converted(log: Log, name: str | Path, settings: ImportSettings) -> Log:
     if log.attitude.shape[1] == 3:
         attitude = axes * units.angle * log.attitude
     else:
-        length = np.linalg.norm(log.attitude, axis=1)
-        wrong = np.abs(length - 1) > 0.01
-        _refuse(f"{name}: attitude: expected quaternions of length 1", wrong, length)
         attitude = log.attitude * [*axes, 1]
     rotation = replace(log, attitude=attitude).rotation
 
@@ -97,11 +117,56 @@ def converted(log: Log, name: str | Path, settings: ImportSettings) -> Log:
     )
 
 
-def _refuse(expected: str, wrong: np.ndarray, values: np.ndarray) -> None:
-    """Raises `DataError` where samples are wrong: `[N]` whether each is, of `[N, ...]` values."""
-    samples = np.flatnonzero(wrong)
-    if len(samples):
-        first = samples[0]
-        raise DataError(
-            f"{expected}, found {values[first]} in sample {first} among {len(samples)} such"
-        )
+def _usable(
+    name: str | Path, log: Log, fields: Sequence[str], gap: float, said: dict[str, int]
+) -> list[np.ndarray]:
+    """Indices of the samples that can be used, apart wherever their clock was set back.
+
+    fields: of the samples, stamps first; gap: by which a clock is set back, in units of the stamps,
+    where a single stamp that falls back is only wrong; said: what is said of others.
+    """
+    stamps = getattr(log, fields[0])
+    usable = np.ones(len(stamps), bool)
+
+    def called(field: str) -> str:
+        return f"{name}: {'time of commands' if field == 'command_time' else field}:"
+
+    def leave_out(expected: str, wrong: np.ndarray, values: np.ndarray) -> None:
+        samples = np.flatnonzero(wrong & usable)
+        if not len(samples):
+            return
+        usable[samples] = False
+        first, last = samples[0], len(stamps) - 1
+        found = f"{expected}, found {values[first]} in sample {first} among {len(samples)} such"
+        if 2 * len(samples) > len(stamps):
+            raise DataError(found)
+        before, after = stamps[max(first - 1, 0)], stamps[min(first + 1, last)]
+        said[f"{found}, between {before:.10g} and {after:.10g}: left out"] = len(samples)
+
+    for field in fields:
+        values = getattr(log, field)
+        if values is None:
+            continue
+        if not len(values):
+            raise DataError(f"{called(field)} expected one value or more, found none")
+        fine = np.isfinite(values.reshape(len(values), -1)).all(1)
+        leave_out(f"{called(field)} expected finite numbers", ~fine, values)
+        if field == "attitude" and values.shape[1] == 4:
+            length = np.linalg.norm(values, axis=1)
+            leave_out(
+                f"{called(field)} expected quaternions of length 1",
+                np.abs(length - 1) > 0.01,
+                length,
+            )
+    number = np.flatnonzero(usable)
+    time = stamps[number]
+    fallen = np.flatnonzero(np.diff(time) < -gap) + 1
+    back = [i for i in fallen if i + 1 < len(time) and time[i + 1] <= time[i - 1]]
+    for i in back:
+        said[f"{called(fields[0])} is set back from {time[i - 1]:.10g} to {time[i]:.10g}"] = 0
+    parts = np.split(number, back)
+    late = np.zeros(len(stamps), bool)
+    for part in parts:
+        late[part[1:]] = stamps[part[1:]] <= np.maximum.accumulate(stamps[part[:-1]])
+    leave_out(f"{called(fields[0])} expected stamps that increase", late, stamps)
+    return [part[usable[part]] for part in parts]

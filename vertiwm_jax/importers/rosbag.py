@@ -15,6 +15,8 @@ from vertiwm_jax.learning.schema import DataError
 _ODOMETRY = ("nav_msgs/msg/Odometry",)
 _ACKERMANN = ("ackermann_msgs/msg/AckermannDriveStamped", "ackermann_msgs/msg/AckermannDrive")
 _TWIST = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
+_SLOWEST = 0.05  # m/s at full size
+_FARTHEST = np.radians(45)
 
 # Bags of ROS 2 up to Humble do not say what their messages hold; these are not in its base.
 DEFINITIONS = {
@@ -71,23 +73,27 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
         command_time=command_time,
         command=np.stack([speed, turn], axis=1),
     )
-    found = converted(found, path, settings)
-    if is_twist[0] and names.twist == "yaw_rate":
-        speed, yaw_rate = found.command.T
-        vehicle = settings.vehicle
-        # At full size the wheelbase is `scale` times as long; the yaw rate is still the vehicle's.
-        angle = steering(speed, yaw_rate, vehicle.wheelbase * vehicle.scale**0.5)
-        found = replace(found, command=np.stack([speed, angle], axis=1))
-    return [found]
+    logs = converted(found, path, settings)
+    if not (is_twist[0] and names.twist == "yaw_rate"):
+        return logs
+    # At full size the wheelbase is `scale` times as long; the yaw rate is still the vehicle's.
+    wheelbase = settings.vehicle.wheelbase * settings.vehicle.scale**0.5
+    angles = [steering(log.command[:, 0], log.command[:, 1], wheelbase) for log in logs]
+    return [
+        replace(log, command=np.stack([log.command[:, 0], angle], axis=1))
+        for log, angle in zip(logs, angles, strict=True)
+    ]
 
 
 def steering(speed: np.ndarray, yaw_rate: np.ndarray, wheelbase: float) -> np.ndarray:
     """`[M]` m/s and rad/s to the `[M]` front-wheel angles, rad, that turn so without slip.
 
-    At zero speed a yaw rate gives no angle: the wheels keep theirs, and are straight at first.
+    No wheel turns beyond `_FARTHEST`. At next to no speed a yaw rate gives no angle: the wheels
+    keep theirs, and are straight at first.
     """
-    moving = speed != 0
+    moving = np.abs(speed) >= _SLOWEST
     angle = np.arctan(wheelbase * yaw_rate / np.where(moving, speed, 1))
+    angle = np.clip(angle, -_FARTHEST, _FARTHEST)
     latest = np.maximum.accumulate(np.where(moving, np.arange(len(speed)), -1))
     return np.where(latest >= 0, angle[latest], 0)
 

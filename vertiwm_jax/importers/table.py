@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,21 +24,22 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
     if table is None:
         raise DataError(f"{path}: expected settings with a section `table` that names its columns")
     columns_of = _parquet_columns if path.suffix == ".parquet" else _csv_columns
-    columns = columns_of(path, _names(table))
+    columns, remarks = columns_of(path, _names(table))
     if table.drive is None:
-        return [_log(str(path), columns, table, settings)]
+        return converted(_log(str(path), columns, table), path, settings, remarks)
     drives = columns.pop(table.drive).astype(str)
     labels, first = np.unique(drives, return_index=True)
     logs = []
     for label in labels[np.argsort(first)]:
         own = {name: column[drives == label] for name, column in columns.items()}
-        logs.append(_log(f"{path}: drive {label}", own, table, settings))
+        name = f"{path}: drive {label}"
+        logs += converted(_log(name, own, table), name, settings, remarks if not logs else {})
     return logs
 
 
-def _csv_columns(path: Path, names: Sequence[str]) -> Columns:
-    """Columns of a CSV file with a header line, as text."""
-    cells = []
+def _csv_columns(path: Path, names: Sequence[str]) -> tuple[Columns, dict[str, int]]:
+    """Columns of a CSV file with a header line, as text, and what is said of its other lines."""
+    cells, others = [], []
     with (
         refusing(lambda found: DataError(f"{path}: expected a CSV file in UTF-8: {found}")),
         path.open(newline="", encoding="utf-8-sig") as file,
@@ -49,26 +51,30 @@ def _csv_columns(path: Path, names: Sequence[str]) -> Columns:
         for row in rows:
             if not any(cell.strip() for cell in row):
                 continue
-            if len(row) != len(head):
-                raise DataError(
+            if len(row) == len(head):
+                cells.append([row[place] for place in places])
+            else:
+                others.append(
                     f"{path}: line {rows.line_num}: expected {len(head)} values as in the head, "
                     f"found {len(row)}"
                 )
-            cells.append([row[place] for place in places])
+    if len(others) > len(cells):
+        raise DataError(f"{others[0]}; {len(others)} such")
     if not cells:
         raise DataError(f"{path}: expected rows below the head, found none")
-    return dict(zip(names, np.array(cells).T, strict=True))
+    remarks = {f"{others[0]}: left out {len(others)} such lines": len(others)} if others else {}
+    return dict(zip(names, np.array(cells).T, strict=True)), remarks
 
 
-def _parquet_columns(path: Path, names: Sequence[str]) -> Columns:
-    """Columns of a Parquet file; needs pyarrow."""
+def _parquet_columns(path: Path, names: Sequence[str]) -> tuple[Columns, dict[str, int]]:
+    """Columns of a Parquet file, of which nothing is left out; needs pyarrow."""
     with needs("pyarrow", "logs", path):
         from pyarrow.parquet import ParquetFile
     with refusing(lambda found: DataError(f"{path}: expected a Parquet file: {found}")):
         file = ParquetFile(path)
         _check_head(path, names, file.schema_arrow.names)
         table = file.read(columns=list(names))
-        return {name: table[name].to_numpy() for name in names}
+        return {name: table[name].to_numpy() for name in names}, {}
 
 
 def _names(table: Table) -> list[str]:
@@ -77,7 +83,7 @@ def _names(table: Table) -> list[str]:
     return list(dict.fromkeys(name for group in groups for name in group))
 
 
-def _log(name: str, columns: Columns, table: Table, settings: ImportSettings) -> Log:
+def _log(name: str, columns: Columns, table: Table) -> Log:
     numbers = {key: _numbers(name, key, column) for key, column in columns.items()}
 
     def stacked(names: Sequence[str]) -> np.ndarray:
@@ -86,7 +92,7 @@ def _log(name: str, columns: Columns, table: Table, settings: ImportSettings) ->
     speed = numbers[table.speed]
     if table.brake is not None:
         speed = speed - numbers[table.brake]
-    found = Log(
+    return Log(
         time=numbers[table.time],
         position=stacked(table.position),
         attitude=stacked(table.quaternion or table.rpy or ()),
@@ -95,14 +101,24 @@ def _log(name: str, columns: Columns, table: Table, settings: ImportSettings) ->
         command_time=numbers[table.time],
         command=np.stack([speed, numbers[table.steering]], axis=1),
     )
-    return converted(found, name, settings)
 
 
 def _numbers(name: str, key: str, column: np.ndarray) -> np.ndarray:
+    """A column as numbers, NaN where it holds something else; `DataError` if that is usual."""
     try:
         return column.astype(np.float64)
     except (ValueError, TypeError) as error:
-        raise DataError(f"{name}: {key}: expected numbers: {error}") from None
+        numbers = np.array([_number(cell) for cell in column])
+        if 2 * np.isnan(numbers).sum() > len(numbers):
+            raise DataError(f"{name}: {key}: expected numbers: {error}") from None
+        return numbers
+
+
+def _number(cell: Any) -> float:
+    try:
+        return float(cell)
+    except (ValueError, TypeError):
+        return np.nan
 
 
 def _check_head(path: Path, names: Sequence[str], head: Sequence[str]) -> None:

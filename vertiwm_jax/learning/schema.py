@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vertiwm_jax import atomic
-from vertiwm_jax.errors import UserError
+from vertiwm_jax.errors import UserError, refusing
 from vertiwm_jax.state import STEP_SECONDS
 
 WHEEL_SIGNALS = {
@@ -75,11 +75,10 @@ def read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
     Raises `DataError` unless all of it can be used. Class ids need the map: see `check_classes`.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            found = {name: archive[name] for name in (*_SHAPES, "meta") if name in archive}
-    except Exception as error:  # Zip, codecs and NumPy's header parser each have their own.
-        raise DataError(f"{path}: expected an .npz archive of plain arrays: {error}") from error
+    expected = f"{path}: expected an .npz archive of plain arrays"
+    refused = refusing(lambda found: DataError(f"{expected}: {found}"))
+    with refused, np.load(path, allow_pickle=False) as archive:
+        found = {name: archive[name] for name in (*_SHAPES, "meta") if name in archive}
     missing = [name for name in (*_REQUIRED, "meta") if name not in found]
     if missing:
         raise DataError(f"{path}: missing {', '.join(missing)}; found {list(found)}")

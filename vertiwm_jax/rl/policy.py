@@ -18,6 +18,7 @@ from vertiwm_jax.config import ConfigError, Count, Share
 from vertiwm_jax.env import agent
 from vertiwm_jax.env.controllers import baselines
 from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.errors import refusing
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.networks.policy import (
@@ -204,11 +205,9 @@ def load_policy(folder: str | Path, seed: int = 0) -> Policy:
     config = configuration.load(PolicyConfig, place / "policy.yaml")
     if not 0 <= seed < config.seeds:
         raise ConfigError(f"{folder}: seed: expected 0 to {config.seeds - 1}, found {seed}")
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            arrays = {name: jnp.asarray(stored[name][seed]) for name in stored.files}
-    except Exception as error:  # Of zip files, of what they compress and of NumPy's headers.
-        raise CheckpointError(f"{file}: cannot read weights: {error}") from error
+    refused = refusing(lambda found: CheckpointError(f"{file}: cannot read weights: {found}"))
+    with refused, np.load(file, allow_pickle=False) as stored:
+        arrays = {name: jnp.asarray(stored[name][seed]) for name in stored.files}
     actor, critic = config.networks
     like = jax.eval_shape(partial(_untrained, actor, critic), arrays["observation_mean"])
     names = named_leaves(like)

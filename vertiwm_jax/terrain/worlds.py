@@ -7,7 +7,7 @@ difficulty with the median slope of its low, mid and high worlds, and one beyond
 import functools
 from dataclasses import replace
 from itertools import cycle, islice, product
-from typing import Annotated, ClassVar, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -71,10 +71,6 @@ class WorldConfig:
     rocks: CountOrZero = 0
     trees: CountOrZero = 0
     obstructed: Share = 1.0
-
-    GONE: ClassVar[dict[str, str]] = {
-        "relief": "the shape of procedural ground is no longer set; leave this key out"
-    }
 
 
 def labels(config: WorldConfig, count: int) -> list[tuple[Difficulty | float, Kind]]:
