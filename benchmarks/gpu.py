@@ -143,12 +143,12 @@ def correctness(bench: Benchmark) -> Iterator[Case]:
 
 def driven_apart(_: Program, expected: Any, found: Any) -> Found:
     """How far vehicles are apart in the end, and at most."""
-    metres = np.linalg.norm(found.position - expected.position, axis=-1)
+    meters = np.linalg.norm(found.position - expected.position, axis=-1)
     turns = np.angle(np.exp(1j * (found.rpy - expected.rpy)))
     return {
-        "median_m": float(np.median(metres[:, -1])),
-        "p99_m": float(np.quantile(metres[:, -1], 0.99)),
-        "largest_m": float(np.max(metres)),
+        "median_m": float(np.median(meters[:, -1])),
+        "p99_m": float(np.quantile(meters[:, -1], 0.99)),
+        "largest_m": float(np.max(meters)),
         "largest_deg": float(np.rad2deg(np.max(np.abs(turns)))),
     }
 

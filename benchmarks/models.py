@@ -45,7 +45,7 @@ def drives(batch: int, steps: int) -> tuple[TerrainMap, VehicleState, Command]:
 
 
 def untrained() -> tuple[VertiWM, VertiWMParams]:
-    """A Verti-WM of the paper's size with random weights, for none comes along."""
+    """A Verti-WM of the paper's size with random weights, for none is shipped."""
     params = PAPER.init_params(jax.random.key(0), chrono_like(load_vehicle()))
     return PAPER.verti_wm, with_soil(params, None)
 

@@ -1,7 +1,7 @@
 """Transitions a second of PPO, all included: by default and on the paper's schedule.
 
 A transition is 0.1 s of driving. Beside them the algorithm alone, on an environment that costs
-nothing, with an observation of the same size. Verti-WM is the one that comes along, or with
+nothing, with an observation of the same size. Verti-WM is the shipped one, or with
 `--size paper` one of the paper's size and with four encoders, of random weights, for none ships.
 """
 

@@ -18,7 +18,7 @@ def rates(name: ModelName, batches: tuple[int, ...]) -> dict[str, Figures]:
     """Seconds of a rollout, and of a rollout with its gradient, by batch."""
     model, params = load_model(name)
 
-    def travelled(
+    def traveled(
         params: Params, commands: Command, terrain: TerrainMap, starts: VehicleState
     ) -> jax.Array:
         def one(start: VehicleState, command: Command) -> jax.Array:
@@ -32,8 +32,8 @@ def rates(name: ModelName, batches: tuple[int, ...]) -> dict[str, Figures]:
     for batch in batches:
         terrain, starts, commands = drives(batch, STEPS)
         given = params, commands, terrain, starts
-        forward = measure(jax.jit(travelled), *given, repeats=3)
-        gradient = jax.jit(jax.grad(travelled, argnums=(0, 1), allow_int=True))
+        forward = measure(jax.jit(traveled), *given, repeats=3)
+        gradient = jax.jit(jax.grad(traveled, argnums=(0, 1), allow_int=True))
         both = measure(gradient, *given, repeats=3)
         results[f"{name}, batch {batch}"] = {
             "forward_s": forward["median_s"],

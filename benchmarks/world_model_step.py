@@ -1,6 +1,6 @@
 """A step of Verti-WM, part by part: what it has to compute, and what that takes.
 
-It is the one that comes along, or with `--size paper` one of the paper's size, untrained.
+It is the shipped one, or with `--size paper` one of the paper's size, untrained.
 
 The floor of a part is what its FLOPs, or its inputs and outputs, would take at the machine's own
 ceilings, which are measured first: a matmul of 1024 x 1024, and adding a large array to another,

@@ -1,7 +1,7 @@
 """The terrain map in PyTorch: patches by `grid_sample`, and ground under points.
 
 As `vertiwm_jax.terrain.query`, for the patches of the shipped model: heights relative to the
-vehicle, bilinear, and the colour of the cell of each pixel.
+vehicle, bilinear, and the color of the cell of each pixel.
 """
 
 from typing import Any, NamedTuple
@@ -32,14 +32,14 @@ _NORTH_UP = torch.tensor([1.0, -1.0])
 class Ground(NamedTuple):
     """The map under each vehicle of a batch, or of each world.
 
-    heights: `[B, 1, R, C]` m, on vertices. colours: `[B, 3, r, c]` in [-1, 1], of cells.
+    heights: `[B, 1, R, C]` m, on vertices. colors: `[B, 3, r, c]` in [-1, 1], of cells.
     semantic: `[B, r, c]` class ids. friction: `[B, r, c]`, 0 on soil.
     deformable: `[K]` bool. soils: `[K, 6]`, in the order of `SOIL`.
     origin: `[2]` x, y of vertex (0, 0), m. extent: `[2]` m. resolution: m between vertices.
     """
 
     heights: Tensor
-    colours: Tensor
+    colors: Tensor
     semantic: Tensor
     friction: Tensor
     deformable: Tensor
@@ -58,7 +58,7 @@ class Ground(NamedTuple):
         soils: Any = [getattr(query.soils(terrain), name) for name in SOIL]
         return cls(
             heights=tensor(terrain.elevation)[:, None],
-            colours=tensor(palette[semantic].transpose(0, 3, 1, 2)).contiguous(),
+            colors=tensor(palette[semantic].transpose(0, 3, 1, 2)).contiguous(),
             semantic=tensor(semantic),
             friction=tensor(terrain.friction if grip is None else grip * terrain.friction),
             deformable=tensor(terrain.deformable),
@@ -72,7 +72,7 @@ class Ground(NamedTuple):
         """The world `[B]` of each vehicle: `grid_sample` wants one image for each."""
         return self._replace(
             heights=self.heights[worlds],
-            colours=self.colours[worlds],
+            colors=self.colors[worlds],
             semantic=self.semantic[worlds],
             friction=self.friction[worlds],
         )
@@ -88,7 +88,7 @@ class Surface(NamedTuple):
 
 
 def patches(ground: Ground, state: Tensor) -> tuple[Tensor, Tensor]:
-    """States `[B, 12]` to elevation `[B, 1, 128, 128]` and colours `[B, 3, 128, 128]`.
+    """States `[B, 12]` to elevation `[B, 1, 128, 128]` and colors `[B, 3, 128, 128]`.
 
     Row 0 is farthest ahead, column 0 farthest left; both in [-1, 1].
     """
@@ -103,11 +103,11 @@ def patches(ground: Ground, state: Tensor) -> tuple[Tensor, Tensor]:
     heights = F.grid_sample(
         ground.heights, grid, mode="bilinear", padding_mode="border", align_corners=True
     )
-    colours = F.grid_sample(
-        ground.colours, grid, mode="nearest", padding_mode="border", align_corners=False
+    colors = F.grid_sample(
+        ground.colors, grid, mode="nearest", padding_mode="border", align_corners=False
     )
     elevation = (heights - state[:, 2, None, None, None]) / RELIEF_METERS
-    return elevation.clamp(-1, 1), colours
+    return elevation.clamp(-1, 1), colors
 
 
 def surface(ground: Ground, xy: Tensor) -> Surface:

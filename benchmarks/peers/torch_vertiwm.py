@@ -133,8 +133,8 @@ class TorchVertiWM(nn.Module):
 
     def look(self, ground: Ground, state: Tensor) -> Tensor:
         """The encoded ground `[B, 36, 16, 16]` at states `[B, 12]`."""
-        elevation, colours = patches(ground, state)
-        return torch.cat([self.elevation(elevation), self.semantic(colours)], dim=1)
+        elevation, colors = patches(ground, state)
+        return torch.cat([self.elevation(elevation), self.semantic(colors)], dim=1)
 
     def by_transformer(
         self, history: History, state: Tensor, command: Tensor

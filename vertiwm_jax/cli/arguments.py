@@ -12,8 +12,8 @@ from vertiwm_jax import xla
 
 T = TypeVar("T")
 _CONFIG_HELP = """
---config NAME or FILE: YAML file that gives the fields below their values, or the name of one that
-comes along. --verbose: say which compiler options the installed JAX does not know.
+--config NAME or FILE: YAML file that gives the fields below their values, or the name of
+a shipped one. --verbose: say which compiler options the installed JAX does not know.
 """
 
 
@@ -29,7 +29,7 @@ def with_file(cls: type[T], file: str | Path, name: str, words: list[str]) -> T:
     """Reads `[--config NAME or FILE] [--resume RUN] [--verbose] [--any.field VALUE]`.
 
     Values come from the YAML file `file`, or from the one that `--config` names, or from the
-    configuration of the run to `--resume`; names are those of files that come along. Every field
+    configuration of the run to `--resume`; names are those of shipped files. Every field
     can then be set by its dotted name, with dashes or underscores. Bad input ends the process with
     status 2 and an error that names the file or option.
     """

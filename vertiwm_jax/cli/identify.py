@@ -27,7 +27,7 @@ def identify(
     Args:
         drives: Folders of drives, as `collect` and `import_drives` write them.
         output: YAML file of the vehicle to write, for `--vehicle` of other commands.
-        vehicle: Numbers to begin with: the name of a vehicle that comes along, or a YAML file of
+        vehicle: Numbers to begin with: the name of a shipped vehicle, or a YAML file of
             one.
         free: Which of its numbers to find.
         horizon: Steps of 0.1 s that are predicted.

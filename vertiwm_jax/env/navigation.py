@@ -372,9 +372,9 @@ def make_env(
         terrain: W worlds, or a map file, or a folder of maps; by default two procedural worlds of
             each suite that policies are tested on.
         model: what moves the vehicle, see `load_model`.
-        vehicle: a vehicle, the name of one that comes along, or a YAML file of one; learned models
+        vehicle: a vehicle, the name of a shipped one, or a YAML file of one; learned models
             move the one that they were fitted to.
-        weights: folder of a fitted model; the one that comes along by default.
+        weights: folder of a fitted model; the shipped one by default.
         config: what the task asks.
         pairs: tasks in a world, each from one point of a circle to the opposite one.
         seed: draws the default worlds.

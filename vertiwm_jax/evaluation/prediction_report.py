@@ -42,7 +42,7 @@ class PredictionTest:
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
     vehicle: str = vehicle.HMMWV
-    """What the built-in simulator and the bicycle drive: the name of a vehicle that comes along, or
+    """What the built-in simulator and the bicycle drive: the name of a shipped vehicle, or
     a YAML file of one."""
     soil: SoilSource | None = None
     """Where the models have soils from, if not from where they had them when they were fitted."""

@@ -70,7 +70,7 @@ def fit(
 
     Args:
         drives: a folder of drives, as `load_drives` reads them, or several.
-        config: name of settings that come along (`fit_chrono` for a new model, `fine_tune` to go
+        config: name of shipped settings (`fit_chrono` for a new model, `fine_tune` to go
             on from the pretrained one, ...), or a YAML file of them.
         start: folder of a fitted model to go on from, or `pretrained`; by default what the settings
             say.

@@ -47,7 +47,7 @@ def identify(
 
     Args:
         drives: a folder of drives, as `load_drives` reads them, or several.
-        vehicle: numbers to begin with: of a vehicle that comes along, of a YAML file, or as they
+        vehicle: numbers to begin with: of a shipped vehicle, of a YAML file, or as they
             are.
         free: which fields of `VehicleConfig` to find; pairs get one factor.
         horizon: steps of 0.1 s that are predicted.

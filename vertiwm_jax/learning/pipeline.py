@@ -90,7 +90,7 @@ class PipelineConfig:
     model: ModelConfig = ModelConfig()
     """What is fitted."""
     vehicle: str | None = None
-    """The vehicle whose physics NeSAM corrects: the name of one that comes along, or a YAML file.
+    """The vehicle whose physics NeSAM corrects: the name of a shipped one, or a YAML file.
     By default that of the model to go on from, or else the HMMWV."""
     windows: WindowConfig = WindowConfig(weights=(1.0, 1.0, 2.0))
     """Which windows of the drives are learned from."""

@@ -44,7 +44,7 @@ class Vehicle:
     brake_torque: `[]` N m a wheel at full braking.
     tyre_friction: `[]` the tire's own friction coefficient; contact takes the smaller one.
     hull: `[P, 3]` m, points of the chassis that touch the ground first, underside and roof.
-    length, width: `[]` m, the rectangle that collides with obstacles, centerd on the origin.
+    length, width: `[]` m, the rectangle that collides with obstacles, centered on the origin.
     """
 
     mass: jax.Array
@@ -211,7 +211,7 @@ def load_vehicle(name: str = HMMWV) -> Vehicle:
     """Loads a vehicle.
 
     Args:
-        name: of one that comes along (`hmmwv`, `rover`, ...), or a YAML file of one. The HMMWV of
+        name: of a shipped one (`hmmwv`, `rover`, ...), or a YAML file of one. The HMMWV of
             Chrono, which the shipped model is fitted to, by default.
 
     Returns:

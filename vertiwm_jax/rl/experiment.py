@@ -53,7 +53,7 @@ class TaskConfig:
     seed: int = 0
     """Decides everything that is random."""
     vehicle: str = HMMWV
-    """What the built-in simulator drives: the name of a vehicle that comes along, or a YAML file of
+    """What the built-in simulator drives: the name of a shipped vehicle, or a YAML file of
     one; other models drive what they were fitted to."""
     terrain: Path | None = None
     """A Verti-Bench checkout or a folder of .npz maps; procedural worlds by default."""
@@ -340,7 +340,7 @@ def train(
     Progress is logged; `logging.basicConfig(level="INFO")` shows it.
 
     Args:
-        config: name of settings that come along (`ppo`, `sac`, `td3`, `ppo_small`, ...), or a YAML
+        config: name of shipped settings (`ppo`, `sac`, `td3`, `ppo_small`, ...), or a YAML
             file of them.
         terrain: the worlds to train on, or a path to maps; procedural ones by default.
         runs: folder in which the folder of this run is made.

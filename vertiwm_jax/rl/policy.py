@@ -107,7 +107,7 @@ class PolicyConfig:
     model: ModelName
     """What moved the vehicle."""
     weights: Path | None = None
-    """Folder of that model, if not the one that comes along."""
+    """Folder of that model, if not the shipped one."""
     seeds: Count = 1
     """How many were trained side by side."""
     format: Literal[1] = 1

@@ -61,7 +61,7 @@ class CollectConfig:
     simulator: Literal["builtin", "chrono"] = "builtin"
     """What moves the vehicle; Chrono needs PyChrono, and has the HMMWV alone."""
     vehicle: str = HMMWV
-    """Name of a vehicle that comes along, or a YAML file of one; drives are at its full size."""
+    """Name of a shipped vehicle, or a YAML file of one; drives are at its full size."""
     terrain: Path | None = None
     """A Verti-Bench checkout or a folder of .npz maps, to drive on all of them."""
     obstacles: bool = False
