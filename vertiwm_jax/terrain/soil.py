@@ -71,6 +71,8 @@ PRESETS: dict[str, Soil] = {
 
 def stack(soils: Sequence[Soil]) -> Soil:
     """Stacks S soils with leaves `[...]` to one with leaves `[S, ...]`, float32."""
+    if not soils:
+        raise ValueError("expected at least one soil")
     return jax.tree.map(
         lambda *leaves: jnp.stack([jnp.asarray(x, jnp.float32) for x in leaves]), *soils
     )
