@@ -41,4 +41,4 @@ def refusing(refusal: Callable[[str], UserError]) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        raise refusal(" ".join(f"{type(error).__name__}: {error}".split())) from None
+        raise refusal(" ".join(f"{type(error).__name__}: {error}".split())) from error

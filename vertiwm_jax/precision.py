@@ -9,7 +9,6 @@ import jax.numpy as jnp
 
 P = ParamSpec("P")
 T = TypeVar("T")
-_NARROW = {"float64": jnp.float32, "int64": jnp.int32, "uint64": jnp.uint32}
 
 
 def float32(function: Callable[P, T]) -> Callable[P, T]:
@@ -27,5 +26,5 @@ def float32(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _narrowed(x: Any) -> Any:
-    narrow = _NARROW.get(str(x.dtype)) if isinstance(x, jax.Array) else None
-    return x if narrow is None else jnp.asarray(x, narrow)
+    wide = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.number)
+    return x.astype(jax.dtypes.canonicalize_dtype(x.dtype)) if wide else x

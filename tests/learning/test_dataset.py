@@ -49,6 +49,11 @@ def test_an_empty_folder_and_an_empty_split_are_refused(tmp_path):
     assert len(loaded.length) == 3
 
 
+def test_no_folder_at_all_is_refused():
+    with pytest.raises(DataError, match="^drives: expected a folder of drives or more, found none"):
+        dataset.load_drives([])
+
+
 def test_drives_of_unequal_length_are_padded(tmp_path):
     write(tmp_path, "a.npz", **drives(steps=30), **wheel_signals(steps=30))
     write(tmp_path, "b.npz", **wheel_signals())

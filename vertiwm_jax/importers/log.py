@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.learning.schema import DataError
 
-Some = slice | np.ndarray
+_Some = slice | np.ndarray
 _OF_POSES = "position", "attitude", "velocity", "angular_velocity"
 
 
@@ -45,7 +45,7 @@ class Log:
             return Rotation.from_quat(self.attitude)
         return Rotation.from_euler("ZYX", self.attitude[:, ::-1])
 
-    def part(self, poses: Some, commands: Some = slice(None)) -> "Log":
+    def part(self, poses: _Some, commands: _Some = slice(None)) -> "Log":
         """The log with some of its poses and commands."""
         chosen = dict.fromkeys(("time", *_OF_POSES), poses)
         chosen |= dict.fromkeys(("command_time", "command"), commands)
@@ -153,11 +153,8 @@ def _usable(
         leave_out(f"{called(field)} expected finite numbers", ~fine, values)
         if field == "attitude" and values.shape[1] == 4:
             length = np.linalg.norm(values, axis=1)
-            leave_out(
-                f"{called(field)} expected quaternions of length 1",
-                np.abs(length - 1) > 0.01,
-                length,
-            )
+            wrong = np.abs(length - 1) > 0.01
+            leave_out(f"{called(field)} expected quaternions of length 1", wrong, length)
     number = np.flatnonzero(usable)
     time = stamps[number]
     fallen = np.flatnonzero(np.diff(time) < -gap) + 1

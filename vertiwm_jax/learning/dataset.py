@@ -104,6 +104,8 @@ def load_drives(
                 f"the {split} split, found fewer drives in every file"
             )
         paths += found
+    if not paths:
+        raise DataError("drives: expected a folder of drives or more, found none")
     return _join(paths, parts), stack(maps, [f"map of {path}" for path in paths])
 
 
