@@ -50,7 +50,7 @@ def test_an_empty_folder_and_an_empty_split_are_refused(tmp_path):
 
 
 def test_no_folder_at_all_is_refused():
-    with pytest.raises(DataError, match=r"^drives: expected a folder of drives or more, found none"):
+    with pytest.raises(DataError, match="drives: expected a folder of drives or more, found none"):
         dataset.load_drives([])
 
 
