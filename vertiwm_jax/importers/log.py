@@ -1,10 +1,9 @@
 """A logged drive, checked and converted to SI units, full size and the axes of this project."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -36,7 +35,7 @@ class Log:
     command: np.ndarray
     velocity: np.ndarray | None = None
     angular_velocity: np.ndarray | None = None
-    remarks: Mapping[str, int] = MappingProxyType({})
+    remarks: dict[str, int] = field(default_factory=dict)
 
     @cached_property
     def rotation(self) -> Rotation:
@@ -57,7 +56,7 @@ def converted(
     log: Log,
     name: str | Path,
     settings: ImportSettings,
-    remarks: Mapping[str, int] = MappingProxyType({}),
+    remarks: Iterable[tuple[str, int]] = (),
 ) -> list[Log]:
     """The log in SI units, at full size and in the axes of this project.
 
@@ -143,18 +142,18 @@ def _usable(
         before, after = stamps[max(first - 1, 0)], stamps[min(first + 1, last)]
         said[f"{found}, between {before:.10g} and {after:.10g}: left out"] = len(samples)
 
-    for field in fields:
-        values = getattr(log, field)
+    for quantity in fields:
+        values = getattr(log, quantity)
         if values is None:
             continue
         if not len(values):
-            raise DataError(f"{called(field)} expected one value or more, found none")
+            raise DataError(f"{called(quantity)} expected one value or more, found none")
         fine = np.isfinite(values.reshape(len(values), -1)).all(1)
-        leave_out(f"{called(field)} expected finite numbers", ~fine, values)
-        if field == "attitude" and values.shape[1] == 4:
+        leave_out(f"{called(quantity)} expected finite numbers", ~fine, values)
+        if quantity == "attitude" and values.shape[1] == 4:
             length = np.linalg.norm(values, axis=1)
             wrong = np.abs(length - 1) > 0.01
-            leave_out(f"{called(field)} expected quaternions of length 1", wrong, length)
+            leave_out(f"{called(quantity)} expected quaternions of length 1", wrong, length)
     number = np.flatnonzero(usable)
     time = stamps[number]
     fallen = np.flatnonzero(np.diff(time) < -gap) + 1

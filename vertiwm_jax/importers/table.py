@@ -26,14 +26,14 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
     columns_of = _parquet_columns if path.suffix == ".parquet" else _csv_columns
     columns, remarks = columns_of(path, _names(table))
     if table.drive is None:
-        return converted(_log(str(path), columns, table), path, settings, remarks)
+        return converted(_log(str(path), columns, table), path, settings, remarks.items())
     drives = columns.pop(table.drive).astype(str)
     labels, first = np.unique(drives, return_index=True)
     logs = []
     for label in labels[np.argsort(first)]:
         own = {name: column[drives == label] for name, column in columns.items()}
         name = f"{path}: drive {label}"
-        logs += converted(_log(name, own, table), name, settings, remarks if not logs else {})
+        logs += converted(_log(name, own, table), name, settings, () if logs else remarks.items())
     return logs
 
 
