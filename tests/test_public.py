@@ -1,6 +1,8 @@
 """The public face: what `import vertiwm_jax` offers, and short programs that use it alone."""
 
 import ast
+import pkgutil
+from importlib import import_module
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 
 import vertiwm_jax as vw
+from vertiwm_jax.cli import COMMANDS
 
 
 def test_every_public_name_is_there_and_documented():
@@ -25,6 +28,16 @@ def test_every_public_name_is_there_and_documented():
         assert name in dir(vw)
     with pytest.raises(AttributeError, match="no attribute 'fly'"):
         vw.fly  # noqa: B018
+
+
+@pytest.mark.smoke
+def test_every_module_is_one_for_this_python():
+    """Without the packages of extras, too; entry points of commands are no modules to import."""
+    names = [found.name for found in pkgutil.walk_packages(vw.__path__, "vertiwm_jax.")]
+    modules = [name for name in names if name.removeprefix("vertiwm_jax.") not in COMMANDS]
+    for name in modules:
+        import_module(name)
+    assert len(modules) > 100
 
 
 @pytest.mark.integration
