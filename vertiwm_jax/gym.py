@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium
 import gymnax
+from gymnasium.vector import AutoresetMode
 
 from vertiwm_jax.env.gymnasium import NavigationGymEnv, NavigationVectorEnv
 from vertiwm_jax.env.navigation import NavigationEnv, make_env
@@ -29,9 +30,16 @@ def make(render_mode: str | None = None, **settings: Any) -> NavigationGymEnv:
     return NavigationGymEnv(*make_env(**settings), render_mode)
 
 
-def make_vec(num_envs: int = 1, **settings: Any) -> NavigationVectorEnv:
-    """Many vehicles in one compiled step; what `gymnasium.make_vec` calls."""
-    return NavigationVectorEnv(*make_env(**settings), num_envs)
+def make_vec(
+    num_envs: int = 1,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+    **settings: Any,
+) -> NavigationVectorEnv:
+    """Many vehicles in one compiled step; what `gymnasium.make_vec` calls.
+
+    autoreset_mode: see `NavigationVectorEnv`; settings: arguments of `make_env`.
+    """
+    return NavigationVectorEnv(*make_env(**settings), num_envs, autoreset_mode)
 
 
 def make_gymnax(**settings: Any) -> "GymnaxNavigation":

@@ -62,13 +62,12 @@ def test_vector_resets_in_the_step_that_ends(short):
     again, _ = env.reset(seed=5)
     np.testing.assert_array_equal(first, again)
     assert first in env.observation_space and info == {}
-    actions = np.tile(np.array([1.0, 0.0], np.float32), (4, 1))
-    assert actions in env.action_space
+    assert AHEAD in env.action_space
     for _ in range(2):
-        _, _, terminated, truncated, info = env.step(actions)
+        _, _, terminated, truncated, info = env.step(AHEAD)
         assert not (terminated | truncated).any() and "final_obs" not in info
         assert info["_distance"].all()
-    observation, reward, terminated, truncated, info = env.step(actions)
+    observation, reward, terminated, truncated, info = env.step(AHEAD)
     assert not terminated.any() and truncated.all() and reward.shape == (4,)
     assert observation in env.observation_space
     assert info["_final_obs"].all() and not info["_ending"].any()
@@ -78,11 +77,75 @@ def test_vector_resets_in_the_step_that_ends(short):
         assert (now == starts).all(-1).any() and not (final == starts).all(-1).any()
 
 
+AHEAD = np.tile(np.array([1.0, 0.0], np.float32), (4, 1))
+
+
+def test_vector_resets_in_the_step_after(short):
+    env = NavigationVectorEnv(*short, num_envs=4, autoreset_mode=AutoresetMode.NEXT_STEP)
+    env.reset(seed=5)
+    steps = [env.step(AHEAD) for _ in range(7)]
+    assert [step[3].tolist() for step in steps] == [[i % 4 == 2] * 4 for i in range(7)]
+    last, begun = steps[2][0], steps[3]
+    starts = np.asarray(short[1].start_observation)
+    assert not (last[:, None] == starts).all(-1).any()
+    assert (begun[0][:, None] == starts).all(-1).any(-1).all()
+    assert not begun[1].any() and not begun[2].any() and not begun[4]["_ending"].any()
+    assert "final_obs" not in steps[2][4]
+
+
+def test_vector_resets_only_where_it_is_told(short):
+    env = NavigationVectorEnv(*short, num_envs=4, autoreset_mode="Disabled")
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset all vehicles first"):
+        env.reset(options={"reset_mask": np.array([True, False, False, False])})
+    env.reset(seed=5)
+    env.step(AHEAD)
+    mask = np.array([False, True, False, False])
+    env.reset(options={"reset_mask": mask})
+    env.step(AHEAD)
+    ended, _, _, truncated, _ = env.step(AHEAD)
+    np.testing.assert_array_equal(truncated, ~mask)
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"reset vehicles \[0, 2, 3\] first"):
+        env.step(AHEAD)
+    begun, _ = env.reset(options={"reset_mask": truncated})
+    np.testing.assert_array_equal(begun[1], ended[1])
+    assert env.step(AHEAD)[3].tolist() == mask.tolist()
+
+
+def test_seeds_are_of_vehicles(short):
+    env = NavigationVectorEnv(*short, num_envs=4)
+    first, _ = env.reset(seed=[7, 8, 9, 10])
+    np.testing.assert_array_equal(env.reset(seed=7)[0], first)
+    np.testing.assert_array_equal(env.reset(seed=[10, 9, 8, 7])[0], first[::-1])
+    drawn = [env.reset(seed=[7, None, 9, None])[0] for _ in range(5)]
+    assert all((seen[::2] == first[::2]).all() for seen in drawn)
+    assert len(np.unique([seen[1] for seen in drawn], axis=0)) > 1
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"seed": [1, 2]}, "seed: expected 4 of them, found 2"),
+        ({"options": {"start": 3}}, "options: expected none of these, found start"),
+        ({"options": {"reset_mask": np.ones(3, bool)}}, r"reset_mask: expected \[4\] bool"),
+        ({"options": {"reset_mask": np.zeros(4, bool)}}, "at least one of them true"),
+        ({"options": {"reset_mask": np.arange(4)}}, r"bool, .* found \[0, 1, 2, 3\]"),
+    ],
+)
+def test_what_a_reset_cannot_do_is_refused(short, given, told):
+    with pytest.raises(ValueError, match=told):
+        NavigationVectorEnv(*short, num_envs=4).reset(**given)
+
+
+def test_single_has_no_options(short):
+    with pytest.raises(ValueError, match="options: expected none of these, found start"):
+        NavigationGymEnv(*short).reset(options={"start": 3})
+
+
 def test_vector_agrees_with_single(short):
     env, params = short
     vector = NavigationVectorEnv(env, params, num_envs=4)
     vector.reset(seed=0)
-    states, step = vector._state, jax.jit(env.step_env)
+    states, step = vector._seen[1], jax.jit(env.step_env)
     action = np.array([[0.3, -0.6], [1.0, 0.2], [-1.0, 0.0], [0.0, 1.0]], np.float32)
     observation, reward, *_ = vector.step(action)
     for i in range(4):

@@ -52,7 +52,7 @@ def files(policy: Policy) -> dict[str, bytes | str]:
         "policy.json": json.dumps(about, indent=1) + "\n",
         "policy.npz": arrays.getvalue(),
         "policy.onnx": record(partial(run_policy.act, about, weights), size, 2),
-        "policy.stablehlo": stablehlo.policy(policy, size),
+        "policy.stablehlo": stablehlo.policy(policy, size, about["action"]["standing"]),
         "route.stablehlo": stablehlo.route(task, vehicle),
         "observe.stablehlo": stablehlo.observe(task, vehicle, encoders),
         "run_policy.py": Path(run_policy.__file__).read_bytes(),

@@ -19,6 +19,7 @@ _OPERATORS = {
     np.divide: "Div",
     np.matmul: "MatMul",
     np.maximum: "Max",
+    np.less: "Less",
     np.negative: "Neg",
     np.absolute: "Abs",
     np.tanh: "Tanh",
@@ -144,4 +145,5 @@ _FUNCTIONS: dict[Callable, Callable[..., Recorded]] = {
     np.max: _max,
     np.reshape: lambda x, shape: x.graph.add("Reshape", x, np.array(shape)),
     np.sum: _sum,
+    np.where: lambda condition, x, y: condition.graph.add("Where", condition, x, y),
 }

@@ -57,14 +57,17 @@ def load(folder: str | Path) -> Policy:
 def act(about: About, weights: Weights, observation: np.ndarray) -> np.ndarray:
     """`[B, O]` float32 observations to `[B, 2]` actions in [-1, 1].
 
+    What is not finite is not acted on: the vehicle is to stand still.
     This function and those that it calls do not read shapes of arrays, so that the export can
     record them as an ONNX graph.
     """
-    correction = np.clip(_learned(about, weights, observation), -1, 1)
-    if about["base"] is None:
-        return correction
-    base = {"look ahead": _look_ahead, "straight to goal": _straight_to_goal}[about["base"]["name"]]
-    return np.clip(base(about, observation) + correction, -1, 1)
+    action = np.clip(_learned(about, weights, observation), -1, 1)
+    if about["base"] is not None:
+        bases = {"look ahead": _look_ahead, "straight to goal": _straight_to_goal}
+        base = bases[about["base"]["name"]](about, observation)
+        action = np.clip(base + action, -1, 1)
+    total = np.sum(np.abs(observation), axis=1, keepdims=True)  # Neither of NaN nor of infinity.
+    return np.where(total < np.inf, action, _float32(about["action"]["standing"]))
 
 
 def _learned(about: About, weights: Weights, observation: np.ndarray) -> np.ndarray:

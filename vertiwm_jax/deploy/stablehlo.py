@@ -1,6 +1,6 @@
 """JAX functions as StableHLO files, which `jax.export.deserialize` reads without this package."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -22,11 +22,18 @@ from vertiwm_jax.terrain.map import TerrainMap
 PLATFORMS = ("cpu", "cuda")
 
 
-def policy(act: Callable[[jax.Array], jax.Array], size: int) -> bytes:
-    """Exports `act`: `[B, size]` float32 observations to `[B, 2]` actions, for any B."""
+def policy(act: Callable[[jax.Array], jax.Array], size: int, standing: Sequence[float]) -> bytes:
+    """Exports `act`: `[B, size]` float32 observations to `[B, 2]` actions, for any B.
+
+    standing: the action of standing still, which it gives where an observation is not finite.
+    """
     (batch,) = export.symbolic_shape("batch")
-    # A function, since a policy is a pytree, which cannot be hashed.
-    return _serialized(lambda seen: act(seen), _floats(batch, size))
+
+    def stopping(seen: jax.Array) -> jax.Array:
+        finite = jnp.isfinite(seen).all(axis=1, keepdims=True)
+        return jnp.where(finite, act(seen), jnp.array(standing, jnp.float32))
+
+    return _serialized(stopping, _floats(batch, size))
 
 
 def route(config: NavigationConfig, vehicle: Vehicle) -> bytes:

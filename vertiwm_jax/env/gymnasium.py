@@ -1,9 +1,12 @@
 """The navigation task as Gymnasium environments: one vehicle, or many at once."""
 
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -21,8 +24,29 @@ _ENDINGS = np.array([reason.name.lower() for reason in TerminationReason])
 # Equal environments share what these compile.
 _reset = jax.jit(NavigationEnv.reset_env, static_argnums=0)
 _step = jax.jit(NavigationEnv.step_env, static_argnums=0)
-_reset_all = jax.jit(jax.vmap(NavigationEnv.reset, (None, 0, None)), static_argnums=0)
-_step_all = jax.jit(jax.vmap(NavigationEnv.step, (None, 0, 0, 0, None)), static_argnums=0)
+_keys = jax.jit(jax.vmap(jax.random.key))
+_Seen = tuple[jax.Array, TaskState]
+
+
+@partial(jax.jit, static_argnums=0)
+def _reset_some(
+    env: NavigationEnv, keys: jax.Array, mask: jax.Array, seen: _Seen | None, params: TaskParams
+) -> tuple[jax.Array, _Seen]:
+    """Next keys `[N]`, and observations `[N, O]` and states, new ones where the mask `[N]` is."""
+    keys, now = jnp.unstack(jax.vmap(jax.random.split)(keys), axis=1)
+    begun = jax.vmap(env.reset_env, (0, None))(now, params)
+    if seen is None:
+        return keys, begun
+    return keys, jax.tree.map(lambda new, old: jax.vmap(jnp.where)(mask, new, old), begun, seen)
+
+
+@partial(jax.jit, static_argnums=0)
+def _step_all(
+    env: NavigationEnv, keys: jax.Array, state: TaskState, actions: jax.Array, params: TaskParams
+) -> tuple[jax.Array, Any]:
+    """Next keys `[N]`, and what `step_env` gives for each vehicle."""
+    keys, now = jnp.unstack(jax.vmap(jax.random.split)(keys), axis=1)
+    return keys, jax.vmap(env.step_env, (0, 0, 0, None))(now, state, actions, params)
 
 
 class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -47,7 +71,8 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Draws a start from the pool. `options` is not used."""
+        """Draws a start from the pool. There are no options: `ValueError`."""
+        _refuse(options)
         super().reset(seed=seed)
         self._key = jax.random.key(self.np_random.integers(2**31))
         observation, self._state = self._start()
@@ -75,58 +100,113 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 class NavigationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """Many vehicles in one compiled step, each reset in the step that ends its episode.
+    """N vehicles in one compiled step.
 
-    Where an episode ended, `info["final_obs"]` and `info["final_info"]` hold what it ended with.
+    num_envs: N.
+    autoreset_mode: when a vehicle whose episode is over begins anew. In the same step by default:
+        `info["final_obs"]` and `info["final_info"]` then hold what its episode ended with. Or in
+        the next step, whose action it ignores. Or when `reset(options={"reset_mask": mask})` says.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
-
-    def __init__(self, env: NavigationEnv, params: TaskParams, num_envs: int) -> None:
-        self.num_envs = num_envs
+    def __init__(
+        self,
+        env: NavigationEnv,
+        params: TaskParams,
+        num_envs: int,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+    ) -> None:
+        self.num_envs, self._mode = num_envs, AutoresetMode(autoreset_mode)
+        self.metadata = {"autoreset_mode": self._mode}
         self.single_observation_space = gymnax_space_to_gym_space(env.observation_space())
         self.single_action_space = gymnax_space_to_gym_space(env.action_space())
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._env, self._params = env, params
-        self._state: TaskState | None = None
+        self._seen: _Seen | None = None
+        self._over = np.zeros(num_envs, bool)
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Draws new starts for all vehicles from the pool. `options` is not used."""
-        super().reset(seed=seed)
-        self._key = jax.random.key(self.np_random.integers(2**31))
-        observation, self._state = _reset_all(self._env, self._next_keys(), self._params)
-        return np.array(observation), {}
+        """Draws new starts from the pool.
+
+        Args:
+            seed: of the first vehicle, the others have the numbers that follow; or one for each.
+                None draws on.
+            options: "reset_mask" `[N]` bool: the vehicles that begin anew; all by default.
+
+        Raises:
+            ValueError: an option is unknown, or the seeds or the mask are not N.
+        """
+        options = dict(options or {})
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)))
+        _refuse(options)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise ValueError(
+                f"reset_mask: expected [{self.num_envs}] bool, at least one of them true, found "
+                f"{mask.tolist()}"
+            )
+        if self._seen is None and not mask.all():
+            raise gymnasium.error.ResetNeeded("reset_mask: reset all vehicles first")
+        if isinstance(seed, int | np.integer):
+            seed = range(int(seed), int(seed) + self.num_envs)
+        seeds = [None] * self.num_envs if seed is None else list(seed)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed: expected {self.num_envs} of them, found {len(seeds)}")
+        # Without a seed, a sequence begins anywhere.
+        drawn = [np.random.SeedSequence(seed).generate_state(1)[0] for seed in seeds]
+        keys = _keys(np.array(drawn))
+        if self._seen is not None:
+            given = [seed is not None for seed in seeds]
+            keys = jnp.where(mask & given, keys, self._key)
+        self._key = keys
+        return self._begin(mask), {}
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One step of 0.1 s; ended vehicles return the first observation of their next episode."""
-        if self._state is None:
+        """One step of 0.1 s."""
+        if self._seen is None:
             raise gymnasium.error.ResetNeeded("step: call reset() first")
-        observation, self._state, *outcome = _step_all(
-            self._env, self._next_keys(), self._state, actions, self._params
+        mode, waiting = self._mode, self._over
+        if mode is AutoresetMode.DISABLED and waiting.any():
+            ended = np.flatnonzero(waiting).tolist()
+            raise gymnasium.error.ResetNeeded(f"step: reset vehicles {ended} first, by reset_mask")
+        self._key, (observation, state, *outcome) = _step_all(
+            self._env, self._key, self._seen[1], actions, self._params
         )
+        self._seen = observation, state
         # Copies, since arrays of JAX are read-only.
-        reward, terminated, truncated, info = jax.tree.map(np.array, outcome)
+        reward, terminated, info = jax.tree.map(np.array, outcome)
         info = _named(info)
-        final_observation = info.pop("final_observation")
-        del info["terminated"], info["truncated"]
+        truncated = info["ending"] == "timed_out"
+        # Episodes that are over stay as they are, so that those that wait have ended again.
+        terminated, truncated = terminated & ~waiting, truncated & ~waiting
         over = terminated | truncated
-        infos = _with_masks(info, ~over)
-        if over.any():
+        begin = over if mode is AutoresetMode.SAME_STEP else waiting
+        infos = _with_masks(info, ~begin)
+        if mode is AutoresetMode.SAME_STEP and over.any():
             final = np.full(self.num_envs, None, dtype=object)
             for i in np.flatnonzero(over):
-                final[i] = final_observation[i]
+                final[i] = np.array(observation[i])
             infos |= _with_masks({"final_obs": final, "final_info": _with_masks(info, over)}, over)
-        return np.array(observation), reward, terminated, truncated, infos
+        self._over = over
+        seen = self._begin(begin) if begin.any() else np.array(observation)
+        return seen, reward, terminated, truncated, infos
 
-    def _next_keys(self) -> jax.Array:
-        keys = jax.random.split(self._key, self.num_envs + 1)
-        self._key = keys[0]
-        return keys[1:]
+    def _begin(self, mask: np.ndarray) -> np.ndarray:
+        """All observations, after those of the mask have begun anew."""
+        self._key, seen = _reset_some(self._env, self._key, mask, self._seen, self._params)
+        self._seen, self._over = seen, self._over & ~mask
+        return np.array(seen[0])
+
+
+def _refuse(options: dict[str, Any] | None) -> None:
+    if options:
+        raise ValueError(f"options: expected none of these, found {', '.join(options)}")
 
 
 def _named(info: dict[str, Any]) -> dict[str, Any]:
