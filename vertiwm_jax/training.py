@@ -26,6 +26,9 @@ from vertiwm_jax.runs import Progress, Run
 State = TypeVar("State")
 _log = logging.getLogger(__name__)
 
+NONE = float("inf")
+"""A metric without a value; NaN would stop those who search for NaN (`jax_debug_nans`)."""
+
 
 class Algorithm(ABC, Generic[State]):
     """A learning algorithm: two pure functions, compiled whole; `data` is what it learns from.
@@ -53,7 +56,7 @@ class Algorithm(ABC, Generic[State]):
     def iterate(self, data: Any, state: State) -> tuple[State, dict[str, jax.Array]]:
         """The state after an iteration, and scalar metrics, or arrays whose mean is reported.
 
-        NaN is no value. `finite` says whether training can go on.
+        NaN and `NONE` are no values. `finite` says whether training can go on.
         """
 
 
@@ -230,7 +233,7 @@ def train(
                     f"iteration {done}: loss or weights are no longer finite; {left}; "
                     "try a lower learning rate, and look for inputs that are not finite"
                 )
-            known = {name: values[~np.isnan(values)] for name, values in metrics.items()}
+            known = {name: values[np.isfinite(values)] for name, values in metrics.items()}
             scalars = {name: float(values.mean()) for name, values in known.items() if values.size}
             scalars[work.unit] = done * work.amount
             scalars[f"{work.unit}_per_second"] = work.amount / seconds

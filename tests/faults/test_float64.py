@@ -1,4 +1,4 @@
-"""JAX's switches: float64 widens nothing, and a search for NaN finds none in episodes."""
+"""JAX's switches: float64 widens nothing, and a search for NaN finds none."""
 
 import json
 import os
@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from faults.widened import CASES
+from faults.widened import CASES, RUN
 
 TESTS = Path(__file__).resolve().parents[1]
 
@@ -36,8 +36,8 @@ def test_the_switch_widens_nothing(widened, case):
     assert widened[case] == ["float32"]
 
 
-def test_nothing_is_nan_in_an_episode():
-    assert found(["driven"], JAX_DEBUG_NANS="1") == {"driven": ["float32"]}
+def test_nothing_is_nan_in_episodes_and_trainings():
+    assert found(RUN, JAX_DEBUG_NANS="1") == {case: ["float32"] for case in RUN}
 
 
 @pytest.mark.slow

@@ -47,17 +47,15 @@ def drive(model: Dynamics, params: Any) -> VehicleState:
     )
 
 
-def learn(algorithm: Callable[[NavigationEnv], Any], call: Any = jax.eval_shape) -> Any:
-    """An iteration of a training in the bicycle, which is traced or run."""
+def learn(algorithm: Callable[[NavigationEnv], Any]) -> Any:
+    """Two iterations of a training in the bicycle: the first with no episode that ends."""
     terrain = ground()
     env, params = bicycle_env(terrain, circle_tasks(terrain, pairs=1))
     made = algorithm(env)
-    state = call(made.init, params, jax.random.key(0))
-    return call(made.iterate, params, state)
-
-
-def ppo(env: NavigationEnv) -> PPO:
-    return PPO(env, PPOConfig(**COLLECTED, minibatches=2, epochs=1))
+    first, metrics = jax.jit(made.iterate)(params, made.init(params, jax.random.key(0)))
+    if float(metrics["episodes"]):
+        raise RuntimeError("an episode ended")
+    return jax.jit(made.iterate)(params, first)
 
 
 def driven() -> Any:
@@ -66,16 +64,18 @@ def driven() -> Any:
     return evaluate(LookAhead(env.config), ground(), model="bicycle", pairs=1)
 
 
-RUN = {"driven": driven, "learned": lambda: learn(ppo, lambda function, *given: function(*given))}
+RUN = {
+    "driven": driven,
+    "ppo": lambda: learn(lambda env: PPO(env, PPOConfig(**COLLECTED, minibatches=2, epochs=1))),
+    "sac": lambda: learn(lambda env: SAC(env, SACConfig(**REPLAYED))),
+    "td3": lambda: learn(lambda env: TD3(env, TD3Config(**REPLAYED))),
+}
 CASES = {
     "worlds": lambda: worlds.generate(jax.random.split(jax.random.key(0), 1), worlds.WorldConfig()),
     "bicycle": lambda: drive(KinematicBicycle(), bicycle_of(load_vehicle())),
     "simulator": lambda: drive(Simulator(), chrono_like(load_vehicle())),
     "shipped weights": lambda: drive(*load_model("vertiwm")),
     "gymnax": lambda: gymnax.make(vertiwm_jax.gym.GYMNAX_NAME, terrain=ground(), pairs=1)[1],
-    "ppo": lambda: learn(ppo),
-    "sac": lambda: learn(lambda env: SAC(env, SACConfig(**REPLAYED))),
-    "td3": lambda: learn(lambda env: TD3(env, TD3Config(**REPLAYED))),
 } | RUN
 
 

@@ -17,7 +17,7 @@ from vertiwm_jax.config import Count, Positive, Share, settings
 from vertiwm_jax.networks.policy import Actor, Critic, ObservationLayout, TanhNormalActor
 from vertiwm_jax.rl.policy import DeterministicPolicy, Value
 from vertiwm_jax.rl.running_statistics import RunningStatistics
-from vertiwm_jax.training import Algorithm
+from vertiwm_jax.training import NONE, Algorithm
 
 Metrics = dict[str, jax.Array]
 Outcomes = Callable[[dict[str, jax.Array]], Metrics]
@@ -67,7 +67,7 @@ class Steps:
         return self.terminated | self.truncated
 
     def episode_metrics(self) -> Metrics:
-        """Means over the episodes that ended on all devices, and how many did; NaN if none."""
+        """Means over the episodes that ended on all devices, and how many did; `NONE` if none."""
 
         def sum_of_last(x: jax.Array) -> jax.Array:
             return jnp.sum(jnp.where(self.done, x, 0.0))
@@ -75,7 +75,8 @@ class Steps:
         own = {"episode_return": self.episode_return, "episode_length": self.episode_length}
         count = jnp.sum(self.done, dtype=jnp.float32)
         count, sums = parallel.total((count, jax.tree.map(sum_of_last, own | self.outcomes)))
-        return {"episodes": count, **jax.tree.map(lambda x: x / count, sums)}
+        means = jax.tree.map(lambda x: jnp.where(count, x / jnp.maximum(count, 1), NONE), sums)
+        return {"episodes": count, **means}
 
 
 @settings

@@ -20,7 +20,7 @@ from vertiwm_jax.config import ConfigError, Count, NotNegative, Positive, Share,
 from vertiwm_jax.networks.policy import Critic, TanhNormal, TanhNormalActor, twin_values
 from vertiwm_jax.precision import float32
 from vertiwm_jax.rl.algorithm import LearningConfig, LearningState, Metrics, PolicyAlgorithm, Steps
-from vertiwm_jax.training import all_finite
+from vertiwm_jax.training import NONE, all_finite
 
 Params = Any
 
@@ -181,7 +181,7 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState]):
 
     @abstractmethod
     def learn(self, learner: Learner, batch: Remembered, key: jax.Array) -> tuple[Learner, Metrics]:
-        """A gradient step on a normalized batch; the metrics are scalars, NaN for none."""
+        """A gradient step on a normalized batch; the metrics are scalars, or `NONE`."""
 
     @float32
     def init(self, data: Params, key: jax.Array) -> OffPolicyState:
@@ -214,7 +214,7 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState]):
         """`num_steps` steps of all environments, each with its gradient steps; jit it, donated.
 
         The metrics are scalars. Those of episodes are means over the episodes that ended in
-        this iteration, NaN if there were none; `finite` says whether all weights still are.
+        this iteration, `NONE` if there were none; `finite` says whether all weights still are.
         """
         key, steps_key = jax.random.split(state.key)
         keys = jax.random.split(steps_key, self.config.num_steps)
@@ -231,7 +231,7 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState]):
 
         state, (steps, losses) = jax.lax.scan(advance, state, keys)
         metrics = {
-            **jax.tree.map(jnp.nanmean, losses),
+            **jax.tree.map(mean_of_known, losses),
             **steps.episode_metrics(),
             "reward": jnp.mean(steps.reward),
             "finite": all_finite(state.learner),
@@ -337,11 +337,18 @@ class OffPolicy(PolicyAlgorithm[OffPolicyState]):
         def updates(learner: Learner) -> tuple[Learner, Metrics]:
             keys = jax.random.split(key, self.config.updates)
             learner, losses = jax.lax.scan(update, learner, keys)
-            return learner, jax.tree.map(jnp.nanmean, losses)
+            return learner, jax.tree.map(mean_of_known, losses)
 
         def none(learner: Learner) -> tuple[Learner, Metrics]:
             nothing = jax.eval_shape(updates, learner)[1]
-            return learner, jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), nothing)
+            return learner, jax.tree.map(lambda x: jnp.full(x.shape, NONE, x.dtype), nothing)
 
         learner, losses = jax.lax.cond(self._exploring(state), none, updates, state.learner)
         return replace(state, learner=learner), losses
+
+
+def mean_of_known(x: jax.Array) -> jax.Array:
+    """The mean of a metric's values, without those that are `NONE`; `NONE` if all are."""
+    known = x != NONE
+    mean = jnp.sum(jnp.where(known, x, 0)) / jnp.maximum(jnp.sum(known), 1)
+    return jnp.where(known.any(), mean, NONE)

@@ -144,7 +144,7 @@ class PPO(PolicyAlgorithm[TrainState]):
         """Collects `[T, N]` steps and learns from them; jit it with `state` donated.
 
         The metrics are scalars. Those of episodes are means over the episodes that ended in
-        this iteration, NaN if there were none; `finite` says whether all weights still are.
+        this iteration, `NONE` if there were none; `finite` says whether all weights still are.
         """
         key, collect_key, update_key = jax.random.split(state.key, 3)
         draws = self._draws(collect_key, update_key)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from vertiwm_jax.config import Count, NotNegative, settings
 from vertiwm_jax.rl.algorithm import Metrics
 from vertiwm_jax.rl.off_policy import Learner, OffPolicy, OffPolicyConfig, Params, Remembered
+from vertiwm_jax.training import NONE
 
 
 @settings
@@ -57,7 +58,7 @@ class TD3(OffPolicy):
             return self.fit_actor(learner, actor_loss)[:2]
 
         def keep(learner: Learner) -> tuple[Learner, jax.Array]:
-            return learner, jnp.float32(jnp.nan)
+            return learner, jnp.float32(NONE)
 
         due = learner.extra % config.policy_delay == 0
         learner, policy_loss = jax.lax.cond(due, improve, keep, learner)
