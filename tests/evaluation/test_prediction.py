@@ -1,13 +1,17 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import chex
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from vertiwm_jax.evaluation import error_sources, prediction
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
+from vertiwm_jax.learning.dataset import Drives, WheelSignals
+from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
@@ -18,6 +22,7 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 DRIVES = Path(__file__).parents[1] / "data" / "chrono_drives"
 CONTEXT, HORIZON = 4, 6
+GRASS, MUD = 3, terrain_map.STANDARD.names.index("mud")
 GROUND = TerrainMap.from_array(np.zeros((65, 65)), np.full((8, 8), 3))
 
 
@@ -94,13 +99,37 @@ def test_the_error_is_the_distance_in_space_after_the_last_step():
     np.testing.assert_allclose(errors.growth["rigid"], [0.5 * np.sqrt(3)] * HORIZON, rtol=1e-5)
 
 
-def test_angles_are_compared_around_the_circle():
+def test_headings_are_compared_around_the_circle():
     windows = straight(1)
     turned = windows.state.at[..., 3:6].set(jnp.array([0.1, -0.2, 3.1]))
     recorded = windows.replace(state=turned.at[:, CONTEXT + 1 :, 5].set(-3.1))
     errors = errors_of(Recording(), turned[0], recorded)
-    assert means(errors, "yaw")["rigid"] == pytest.approx(np.degrees(2 * np.pi - 6.2), rel=1e-4)
-    assert means(errors, "roll")["rigid"] == pytest.approx(0.0, abs=1e-5)
+    assert means(errors, "heading")["rigid"] == pytest.approx(2 * np.pi - 6.2, rel=1e-4)
+    assert means(errors, "tilt")["rigid"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_tilt_is_the_angle_between_verticals_as_the_body_sees_them():
+    rng = np.random.default_rng(0)
+    ours, theirs = rng.uniform(-1.2, 1.2, (2, 5, 2))
+    windows = straight(5)
+    truth = windows.state.at[:, CONTEXT + 1 :, 3:5].set(ours[:, None])
+    predicted = windows.state.at[:, CONTEXT + 1 :, 3:5].set(theirs[:, None])
+    predicted = predicted.at[..., 5].set(rng.uniform(-3, 3, (5, 1)))
+    test = TestWindows(windows.replace(state=truth), np.arange(5), GROUND)
+    states = VehicleState.from_vector(predicted[:, CONTEXT + 1 :])
+    errors, _ = prediction.absolute_errors(states, test)
+    up = [
+        Rotation.from_euler("xyz", np.c_[both, np.zeros(5)]).inv().apply([0, 0, 1])
+        for both in (ours, theirs)
+    ]
+    expected = np.arccos(np.sum(up[0] * up[1], axis=1))
+    np.testing.assert_allclose(errors["tilt"][:, -1], expected, rtol=1e-4)
+
+
+def test_speed_is_forward_and_has_a_sign():
+    windows = straight(1)
+    backwards = windows.state[0].at[:, 6].multiply(-1.0)
+    assert means(errors_of(Recording(), backwards, windows), "speed")["rigid"] == 2.0
 
 
 def test_constant_velocity_is_right_on_straight_drives():
@@ -152,20 +181,39 @@ def test_tables():
     assert head == ["model", "rigid (n = 5)", "diverged"]
     assert still[0] == "still" and still[1].startswith("1.800 (") and still[2] == "5"
     assert constant == ["constant velocity", "0.000 (0.000-0.000)", "0"]
-    table = prediction.csv_rows(rows)
-    assert len(table) == 2 * len(prediction.MEASURES)
-    assert table[0]["model"] == "still" and table[0]["mean"] == pytest.approx(1.8, rel=1e-4)
 
 
-def test_errors_are_told_after_any_number_of_steps():
-    windows = straight(3)
-    test = TestWindows(windows, np.arange(3), GROUND)
-    still = prediction.predict(Faulty(), jnp.float32(0.0), test).states
-    for steps in (2, HORIZON):
-        row = prediction.summary("still", still, test, steps)
-        assert row.horizon == steps and len(row.growth["rigid"]) == steps
-        assert means(row)["rigid"] == pytest.approx(0.1 * steps * 2, rel=1e-4)
-        assert prediction.format_table([row], "position").startswith(f"{steps}-step position")
+def drives_of(lengths, deformable_from=10**6):
+    """Straight drives at 1, 2, ... m/s, as long as told, on soil from a step on."""
+    steps, count = max(lengths), len(lengths)
+    speed = 1.0 + np.arange(count, dtype=np.float32)[:, None]
+    state = np.zeros((count, steps + 1, 12), np.float32)
+    state[..., 0], state[..., 6] = 0.1 * speed * np.arange(steps + 1), speed
+    control = np.zeros((count, steps, 2), np.float32)
+    control[..., 0] = speed
+    soft = np.arange(steps + 1) >= deformable_from
+    kinds = np.broadcast_to(np.where(soft, MUD, GRASS)[None, :, None], (count, steps + 1, 4))
+    lengths, world = np.array(lengths, np.int32), np.zeros(count, np.int32)
+    return Drives(state, control, lengths, kinds.astype(np.uint8), world, WheelSignals())
+
+
+def test_windows_of_a_horizon_are_those_of_this_horizon_alone():
+    # 4 + 3, 4 + 6 and 4 + 12 steps fit in differently many places of the three drives.
+    drives, horizons = drives_of([20, 11, 8], deformable_from=9), (6, 3, 12)
+    every, tests = TestWindows.nested(drives, GROUND, CONTEXT, horizons, 2)
+    assert list(tests) == [3, 6, 12]
+    predicted = prediction.predict(ConstantVelocity(), None, every)
+    for steps, (rows, test) in tests.items():
+        alone = TestWindows.of(drives, GROUND, CONTEXT, steps, 2)
+        np.testing.assert_array_equal(test.drive, alone.drive)
+        chex.assert_trees_all_equal(test.windows, alone.windows)
+        # What is predicted once for all horizons is what is predicted for it alone.
+        chex.assert_trees_all_equal(
+            predicted.cut(rows, steps), prediction.predict(ConstantVelocity(), None, alone)
+        )
+    assert [len(test.drive) for _, test in tests.values()] == [7 + 3 + 1, 6 + 1, 3]
+    with pytest.raises(DataError, match="at least 25 steps, found at most 20"):
+        TestWindows.nested(drives, GROUND, CONTEXT, (3, 21), 2)
 
 
 def test_error_is_found_where_it_is():

@@ -345,28 +345,38 @@ def test_policies_that_are_none_are_named(run, tmp_path):
 
 def test_predictions_of_drives(tmp_path, capsys):
     drives(tmp_path, count=25, steps=24, speed=4.0)
-    out = tmp_path / "tables"
-    argv = ["prediction", "--data", str(tmp_path), "--context", "2", "--horizon", "4"]
-    door("evaluate")([*argv, "--models", "builtin", "--output", str(out)])
-    assert "| constant velocity | 0.000 (0.000-0.000) | 0 " in capsys.readouterr().out
+    out, rows = tmp_path / "tables", tmp_path / "rows.json"
+    argv = ["prediction", "--data", str(tmp_path), "--context", "2", "--horizons", "8", "4"]
+    door("evaluate")([*argv, "--models", "builtin", "--output", str(out), "--json", str(rows)])
+    text = capsys.readouterr().out
+    assert "| constant velocity | 0.000 (0.000-0.000) |" in text
+    assert text.index("after 4 steps (0.4 s)") < text.index("after 8 steps (0.8 s)")
+    told = json.loads(rows.read_text())
+    found = [row for row in told if row["horizon"] == 4 and row["speed_bin"] == "4-6"]
+    models = ["builtin", "kinematic bicycle", "constant velocity"]
+    assert [(row["model"], row["subset"]) for row in found] == [
+        (model, subset) for model in models for subset in ("all", "rigid")
+    ]
+    # Three drives of the test split, two windows each, straight on at constant speed, 1.6 m.
+    assert all((row["windows"], row["share_of_way"]) == (6, None) for row in found)
+    assert found[0]["position_m"] < 0.1 and found[4]["position_m"] < 1e-4
+    further = [row for row in told if row["horizon"] == 8 and row["model"] == models[2]]
+    assert all(row["windows"] == 3 and row["share_of_way"] < 1e-4 for row in further)
     with (out / "prediction.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["measure"] == "position"]
-    assert [row["model"] for row in rows] == ["builtin", "kinematic bicycle", "constant velocity"]
-    # Three drives of the test split, two windows each, straight on at constant speed.
-    assert all((row["ground"], row["windows"]) == ("rigid", "6") for row in rows)
-    assert float(rows[0]["mean"]) < 0.1 and float(rows[2]["mean"]) < 1e-4
+        assert [row["position_m"] for row in csv.DictReader(file)] == [
+            str(row["position_m"]) for row in told
+        ]
     text = (out / "prediction.md").read_text()
-    assert "4-step yaw error, deg" in text and "ground under the vehicle" in text
+    assert "heading, rad" in text and "ground under the vehicle" in text
     for picture in ("prediction.png", "paths.png"):
         assert (out / picture).stat().st_size > 10_000
-    door("evaluate")(
-        [*argv, "--models", "builtin", "--vehicle", "rover", "--output", f"{out}-rover"]
-    )
-    with (tmp_path / "tables-rover" / "prediction.csv").open() as file:
-        others = [row for row in csv.DictReader(file) if row["measure"] == "position"]
-    assert [a["mean"] != b["mean"] for a, b in zip(rows, others, strict=True)] == [
-        True, True, False,
-    ]  # fmt: skip
+    # The naive rows need not be asked for.
+    door("evaluate")([*argv, "--models", "builtin", "--vehicle", "rover", "--json", str(rows)])
+    others = json.loads(rows.read_text())
+    changed = {
+        a["model"]: a["position_m"] != b["position_m"] for a, b in zip(told, others, strict=True)
+    }
+    assert changed == {"builtin": True, "kinematic bicycle": True, "constant velocity": False}
     assert "rovr" in refusal(door("evaluate"), *argv, "--vehicle", "rovr")
 
 

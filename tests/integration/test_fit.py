@@ -192,7 +192,7 @@ def test_one_specialist_alone_is_fitted_and_compared(fitted, folder, tmp_path, c
     assert stages == {"transformer_single_steps", "transformer_rollouts", "model"}
     capsys.readouterr()
     command = ["prediction", "--data", str(folder / "drives" / "deformable")]
-    command += ["--context", "2", "--horizon", "3", "--stride", "50", "--models", "builtin"]
+    command += ["--context", "2", "--horizons", "3", "--stride", "50", "--models", "builtin"]
     door("evaluate")([*command, "--compare", str(run)])
     assert f"| {run.name}: transformer " in capsys.readouterr().out
     with pytest.raises(CheckpointError, match="expected vertiwm, found transformer alone"):

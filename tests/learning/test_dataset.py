@@ -133,3 +133,12 @@ def test_collections_of_other_classes_are_refused(tmp_path):
     with pytest.raises(MapError, match="class_names: expected") as caught:
         dataset.load_drives([tmp_path / "own", tmp_path / "standard"], "test")
     assert str(caught.value).startswith(f"map of {path}: ")
+
+
+def test_vehicles_are_named_as_the_files_say(tmp_path):
+    said = [{"name": "uaz", "model": "UAZBUS"}, {"model": "HMMWV_Reduced"}, {}, None]
+    for i, vehicle in enumerate(said):
+        meta = {"map": "hill.npz"} | ({} if vehicle is None else {"vehicle": vehicle})
+        write(tmp_path, f"{i}.npz", meta=np.array(json.dumps(meta)))
+    loaded, _ = dataset.load_drives(tmp_path, "test")
+    assert loaded.vehicles == ("uaz", "HMMWV_Reduced", "unnamed", "unnamed")

@@ -1,7 +1,7 @@
 """Open-loop prediction error of dynamics models on recorded drives."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, Self
 
@@ -12,7 +12,8 @@ from jax.typing import ArrayLike
 
 from vertiwm_jax import geometry
 from vertiwm_jax.dynamics import Dynamics, History, Params, disagreement, spread
-from vertiwm_jax.evaluation.tables import Row, markdown
+from vertiwm_jax.evaluation.tables import markdown
+from vertiwm_jax.learning import schema
 from vertiwm_jax.learning import windows as recorded
 from vertiwm_jax.learning.dataset import Drives, WheelSignals
 from vertiwm_jax.learning.objectives import open_loop
@@ -25,9 +26,11 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 MEASURES: dict[str, str] = {
     **dict.fromkeys(("position", "horizontal", "height"), "m"),
-    **dict.fromkeys(("roll", "pitch", "yaw"), "deg"),
+    **dict.fromkeys(("heading", "tilt"), "rad"),
+    "speed": "m/s",
 }
-"""Absolute errors and their units; position is the distance in space."""
+"""Absolute errors and their units: position is the distance in space, tilt the angle between the
+verticals as the body sees them, whatever its heading, and speed is forward, negative backwards."""
 BATCH = 512
 """Windows that are predicted at once, which bounds the memory."""
 
@@ -38,6 +41,7 @@ class TestWindows:
 
     drive: `[N]` index of the drive that each is from. Windows of a drive are much alike, so
         intervals are drawn over drives.
+    vehicles: by world, what the vehicle is called that drove there; of none, none is named.
     """
 
     __test__ = False  # the name starts as pytest's classes do
@@ -45,6 +49,7 @@ class TestWindows:
     windows: Windows
     drive: np.ndarray
     terrain: TerrainMap
+    vehicles: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -52,7 +57,50 @@ class TestWindows:
     ) -> Self:
         """All windows of the drives; raises what `windows.index` raises."""
         index = recorded.index(drives, terrain, context, horizon, stride)
-        return cls(recorded.gather(drives, index), np.asarray(index.drive), terrain)
+        windows = recorded.gather(drives, index)
+        return cls(windows, np.asarray(index.drive), terrain, drives.vehicles)
+
+    @classmethod
+    def nested(
+        cls,
+        drives: Drives,
+        terrain: TerrainMap,
+        context: int,
+        horizons: Sequence[int],
+        stride: int,
+    ) -> tuple[Self, dict[int, tuple[np.ndarray, Self]]]:
+        """Windows that are predicted once and tested after several numbers of steps.
+
+        Returns:
+            N windows of the shortest horizon, drawn out to the longest: commands and states beyond
+            the end of a drive have no meaning. And by horizon, shortest first, the windows that
+            `of` cuts for it alone, and which of the N they are.
+
+        Raises:
+            DataError: no drive is long enough for one of the horizons.
+        """
+        horizons = sorted(horizons)
+        index = recorded.index(drives, terrain, context, horizons[0], stride)
+        steps = np.asarray(drives.length)[index.drive] - np.asarray(index.start) - context
+        tests = {
+            each: (np.flatnonzero(steps >= each), cls.of(drives, terrain, context, each, stride))
+            for each in horizons
+        }
+        beyond = [(0, 0), (0, horizons[-1] - horizons[0]), (0, 0)]
+        longer = replace(
+            drives,
+            state=np.pad(drives.state, beyond, "edge"),
+            control=np.pad(drives.control, beyond, "edge"),
+            wheels=WheelSignals(),
+        )
+        windows = recorded.gather(longer, replace(index, horizon=horizons[-1]))
+        return cls(windows, np.asarray(index.drive), terrain, drives.vehicles), tests
+
+    @property
+    def vehicle(self) -> np.ndarray:
+        """`[N]` what the vehicle of each is called."""
+        names = self.vehicles or (schema.UNNAMED,) * self.terrain.worlds
+        return np.array(names)[np.asarray(self.windows.world)]
 
     @property
     def of_ground(self) -> dict[str, np.ndarray]:
@@ -135,6 +183,10 @@ class Predicted(NamedTuple):
     states: VehicleState
     read: Reading
 
+    def cut(self, rows: np.ndarray, steps: int) -> "Predicted":
+        """The first steps in some of the windows."""
+        return jax.tree.map(lambda x: x[rows, :steps], self)
+
 
 def predict(dynamics: Dynamics, params: Params, test: TestWindows) -> Predicted:
     """Predicts every window open-loop; the results are in host memory.
@@ -161,35 +213,47 @@ def absolute_errors(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """By measure, `[N, K]` in its unit, and `[N]` bool, whether the prediction diverged."""
     windows = test.windows
-    truth = windows.state[:, windows.context + 1 :, :6]
-    start = windows.state[:, windows.context, None, :6]
-    pose = jnp.concatenate([predicted.position, predicted.rpy], axis=-1)
-    lost = ~jnp.all(jnp.isfinite(pose), axis=(1, 2))
-    difference = jnp.where(lost[:, None, None], start, pose) - truth
+    truth = windows.state[:, windows.context + 1 :]
+    start = windows.state[:, windows.context, None]
+    found = predicted.vector
+    lost = ~jnp.all(jnp.isfinite(found), axis=(1, 2))
+    found = jnp.where(lost[:, None, None], start, found)
+    difference = found - truth
     position, horizontal = (jnp.linalg.norm(difference[..., :n], axis=-1) for n in (3, 2))
-    turn = jnp.degrees(jnp.abs(geometry.wrap(difference[..., 3:])))
-    errors = position, horizontal, jnp.abs(difference[..., 2]), *jnp.moveaxis(turn, -1, 0)
-    return dict(zip(MEASURES, map(np.asarray, errors), strict=True)), np.asarray(lost)
+    ours, theirs = _vertical(found), _vertical(truth)
+    apart = jnp.linalg.norm(jnp.cross(ours, theirs), axis=-1), jnp.sum(ours * theirs, axis=-1)
+    errors = {
+        "position": position,
+        "horizontal": horizontal,
+        "height": jnp.abs(difference[..., 2]),
+        "heading": jnp.abs(geometry.wrap(difference[..., 5])),
+        "tilt": jnp.arctan2(*apart),
+        "speed": jnp.abs(difference[..., 6]),
+    }
+    return {name: np.asarray(errors[name]) for name in MEASURES}, np.asarray(lost)
 
 
-def summary(
-    name: str, predicted: VehicleState, test: TestWindows, horizon: int | None = None
-) -> PredictionErrors:
-    """Errors of predictions after `horizon` steps, by default all of them, by kind of ground."""
+def _vertical(state: jax.Array) -> jax.Array:
+    """`[..., 3]`, the direction up as the body at states `[..., 12]` sees it."""
+    roll, pitch = state[..., 3], state[..., 4]
+    parts = -jnp.sin(pitch), jnp.cos(pitch) * jnp.sin(roll), jnp.cos(pitch) * jnp.cos(roll)
+    return jnp.stack(parts, axis=-1)
+
+
+def summary(name: str, predicted: VehicleState, test: TestWindows) -> PredictionErrors:
+    """Errors of predictions after the last step by kind of ground."""
     errors, lost = absolute_errors(predicted, test)
-    horizon = int(horizon or errors["position"].shape[1])
     members = test.of_ground
     final = {
         measure: {
-            kind: bootstrap(error[rows, horizon - 1], test.drive[rows])
-            for kind, rows in members.items()
+            kind: bootstrap(error[rows, -1], test.drive[rows]) for kind, rows in members.items()
         }
         for measure, error in errors.items()
     }
-    position = errors["position"][:, :horizon]
+    position = errors["position"]
     growth = {kind: position[rows].mean(axis=0).tolist() for kind, rows in members.items()}
     count = {kind: int(rows.sum()) for kind, rows in members.items()}
-    return PredictionErrors(name, horizon, final, growth, count, int(lost.sum()))
+    return PredictionErrors(name, position.shape[1], final, growth, count, int(lost.sum()))
 
 
 @float32
@@ -215,8 +279,8 @@ def prediction_errors(
         name: what the model is called.
 
     Returns:
-        Mean absolute errors after the last step, with 95 % intervals, by measure (m and degrees)
-        and by kind of ground.
+        Mean absolute errors after the last step, with 95 % intervals, by measure (`MEASURES`, in m,
+        rad and m/s) and by kind of ground.
 
     Raises:
         DataError: no drive is long enough.
@@ -234,24 +298,6 @@ def format_table(models: Sequence[PredictionErrors], measure: str) -> str:
         rows.append({"model": model.name, **cells, "diverged": model.diverged})
     title = f"{models[0].horizon}-step {measure} error, {MEASURES[measure]}"
     return f"{title}: mean and 95 % interval over drives\n\n{markdown(rows)}"
-
-
-def csv_rows(models: Sequence[PredictionErrors]) -> list[Row]:
-    """A row for each model, measure and kind of ground."""
-    return [
-        {
-            "model": model.name,
-            "steps": model.horizon,
-            "measure": measure,
-            "unit": MEASURES[measure],
-            "ground": kind,
-            "windows": model.count[kind],
-            **vars(error),
-        }
-        for model in models
-        for measure, by_kind in model.final.items()
-        for kind, error in by_kind.items()
-    ]
 
 
 def bootstrap(values: np.ndarray, groups: np.ndarray, draws: int = 1000) -> Interval:

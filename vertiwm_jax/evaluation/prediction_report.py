@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
+from vertiwm_jax import atomic
 from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, settings
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.evaluation import error_sources, plots, prediction
-from vertiwm_jax.evaluation.prediction import MEASURES, Predicted, PredictionErrors, TestWindows
+from vertiwm_jax.evaluation import error_sources, plots, prediction, yardsticks
+from vertiwm_jax.evaluation.prediction import Predicted, TestWindows
 from vertiwm_jax.evaluation.tables import csv_text, markdown, write
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.mechanics import vehicle
@@ -33,11 +34,14 @@ AROUND = 8
 
 @settings
 class PredictionTest:
-    """Open-loop position errors of a model on recorded drives, beside two kinematic baselines."""
+    """Open-loop prediction errors of models on recorded drives.
 
-    data: Path
-    """Folder of `.npz` files of drives, with the maps they name."""
-    models: Models = ("vertiwm", "nesam", "transformer", "builtin")
+    The built-in simulator, a kinematic bicycle and constant velocity are always beside them.
+    """
+
+    data: tuple[Path, ...]
+    """Folders of `.npz` files of drives, with the maps they name."""
+    models: Models = ("vertiwm", "nesam", "transformer")
     """The models."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
@@ -52,21 +56,24 @@ class PredictionTest:
     """Which of the drives."""
     context: CountOrZero = 16
     """Recorded steps that a model sees first."""
-    horizon: Annotated[tuple[Count, ...], AtLeastOne] = (16,)
-    """Steps that it predicts; of several numbers of steps there is a table each."""
+    horizons: Annotated[tuple[Count, ...], AtLeastOne] = (16,)
+    """Steps that it predicts; there are tables for each number of steps, of all windows for which
+    drives are long enough."""
     stride: Count = 16
     """Steps from one window to the next."""
     output: Path | None = None
     """Folder for tables and pictures, also of where and how the first model errs."""
+    json: Path | None = None
+    """File for all errors as a JSON list of rows."""
 
     def run(self) -> str:
-        """Runs the test and writes what `output` asks for; returns position errors as Markdown."""
+        """Runs the test and writes what is asked for; returns the tables as Markdown."""
         drives, terrain = dataset.load_drives(self.data, self.split)
-        test = TestWindows.of(drives, terrain, self.context, max(self.horizon), self.stride)
+        every, tests = TestWindows.nested(drives, terrain, self.context, self.horizons, self.stride)
         driven = vehicle.load(self.vehicle).vehicle
         models: dict[str, tuple[Dynamics, Params]] = {
             name: load_model(name, self.weights, vehicle=driven, soil=self.soil)
-            for name in self.models
+            for name in dict.fromkeys((*self.models, "builtin"))
         }
         for folder in self.compare:
             fitted = load_fitted(folder / "model")
@@ -76,40 +83,48 @@ class PredictionTest:
         predicted = {}
         with Progress(len(models), "models") as progress:
             for name, model in models.items():
-                predicted[name] = prediction.predict(*model, test)
-                progress.advance(1, f"{name}, {len(test.drive):,} windows")
-        errors = [
-            [prediction.summary(name, x.states, test, steps) for name, x in predicted.items()]
-            for steps in sorted(self.horizon)
-        ]
-        if self.output:
-            drawn = {name: predicted[name] for name in self.models}
-            write(self.output, dict(_files(errors, test, drawn)))
-        return "\n\n".join(prediction.format_table(rows, "position") for rows in errors)
+                predicted[name] = prediction.predict(*model, every)
+                progress.advance(1, f"{name}, {len(every.drive):,} windows")
+        found, tables = [], []
+        for steps, (rows, test) in tests.items():
+            cut = {name: each.cut(rows, steps) for name, each in predicted.items()}
+            made = [
+                row
+                for name, each in cut.items()
+                for row in yardsticks.rows(name, each.states, test, self.split)
+            ]
+            found += made
+            tables.append(yardsticks.table(made))
+            if self.output and steps == max(tests):
+                drawn = {name: cut[name] for name in self.models}
+                growth = {
+                    name: prediction.summary(name, each.states, test).growth
+                    for name, each in cut.items()
+                }
+                files = {"prediction.csv": csv_text([vars(row) for row in found])}
+                files |= {"prediction.png": error_growth(growth)}
+                write(self.output, files | dict(_files(tables, test, drawn)))
+        if self.json:
+            atomic.write(self.json, yardsticks.json_text(found))
+        return "\n\n".join(tables)
 
 
 def _files(
-    errors: Sequence[Sequence[PredictionErrors]],
-    test: TestWindows,
-    predicted: Mapping[str, Predicted],
+    tables: Sequence[str], test: TestWindows, predicted: Mapping[str, Predicted]
 ) -> Iterable[tuple[str, str | Figure]]:
-    """All measures as Markdown and CSV, and pictures, by file name.
+    """The tables, with where and how the first model errs, and pictures of it, by file name.
 
-    errors: of all models, for each horizon, the longest last. predicted: by the models whose paths
-        are drawn; the first of them is looked into.
+    predicted: by the models whose paths are drawn, over the longest horizon.
     """
     name, (states, read) = next(iter(predicted.items()))
     error = prediction.absolute_errors(states, test)[0]["position"][:, -1]
-    tables = [prediction.format_table(rows, measure) for rows in errors for measure in MEASURES]
     shares = markdown(error_sources.shares(test, error))
-    tables += [f"Position error of {name}, where it is", shares]
+    tables = [*tables, f"Position error of {name}, where it is", shares]
     if of_wheels := error_sources.wheels(read.wheels, test):
         steps = states.position.shape[1]
         title = f"Wheels of {name} after {steps} steps, beside those recorded"
         tables += [title, markdown(of_wheels)]
     yield "prediction.md", "\n\n".join(tables) + "\n"
-    yield "prediction.csv", csv_text([row for rows in errors for row in prediction.csv_rows(rows)])
-    yield "prediction.png", error_growth({row.name: row.growth for row in errors[-1]})
     yield "paths.png", paths(_chosen(test, error, predicted))
     if read.coefficients is not None and (traces := crossings(test, read.coefficients)):
         yield "coefficients.png", coefficients(traces)

@@ -54,7 +54,8 @@ class Drives:
 
     state: `[D, T + 1, 12]` float32; control: `[D, T, 2]` float32; length: `[D]` valid steps, later
     values have no meaning; wheel_class: `[D, T + 1, 4]` uint8; world: `[D]` index into
-    the terrain map; wheels: leaves `[D, T + 1, ...]` float32.
+    the terrain map; wheels: leaves `[D, T + 1, ...]` float32; vehicles: by world, the name of the
+    vehicle that drove there, static.
     """
 
     state: Array
@@ -63,6 +64,7 @@ class Drives:
     wheel_class: Array
     world: Array
     wheels: WheelSignals
+    vehicles: tuple[str, ...] = struct.field(default=(), pytree_node=False)
 
 
 @float32
@@ -149,4 +151,4 @@ def _join(paths: list[Path], parts: list[dict[str, np.ndarray]]) -> Drives:
     signals = WheelSignals(
         **{name: joined.pop(name) for name in schema.WHEEL_SIGNALS if name in joined}
     )
-    return Drives(**joined, wheels=signals)
+    return Drives(**joined, wheels=signals, vehicles=tuple(map(schema.vehicle_name, paths)))

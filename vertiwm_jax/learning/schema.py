@@ -5,7 +5,8 @@ A collection is a folder of `.npz` files, one a world, each with K drives of T s
     state          [K, T + 1, 12]    p_world m, roll pitch yaw rad, v_body m/s, omega_body rad/s
     control        [K, T, 2]         commanded speed m/s, front-wheel angle rad, from t to t + 1
     length         [K]               valid steps of each drive
-    meta           text              JSON with "map", the file name of the terrain map
+    meta           text              JSON with "map", the file name of the terrain map; may have
+                                     "vehicle": {"name": ...}
 
 and, as far as they were recorded (wheels in the order FL, FR, RL, RR),
 
@@ -42,6 +43,8 @@ WHEEL_SIGNALS = {
     "steer_angle": (2,),
 }
 """What may be recorded beside the states, and its shape at one moment."""
+UNNAMED = "unnamed"
+"""A vehicle whose name no file says."""
 _REQUIRED = {"state": (12,), "control": (2,), "length": ()}
 _SHAPES = {**_REQUIRED, "wheel_class": (4,), **WHEEL_SIGNALS}
 _ALL = slice(None)
@@ -84,6 +87,14 @@ def read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise DataError(f"{path}: missing {', '.join(missing)}; found {list(found)}")
     meta = str(found.pop("meta"))
     return check(path, found), _parse(path, meta, "wheel_class" in found)
+
+
+def vehicle_name(path: Path) -> str:
+    """What a file, which can be read, calls its vehicle by name or model; or else `UNNAMED`."""
+    with np.load(path, allow_pickle=False) as archive:
+        vehicle = json.loads(str(archive["meta"])).get("vehicle")
+    said = vehicle if isinstance(vehicle, dict) else {}
+    return str(said.get("name") or said.get("model") or UNNAMED)
 
 
 def drive(state: np.ndarray, control: np.ndarray, **others: np.ndarray) -> dict[str, np.ndarray]:
