@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from importers.logged import Logged
 from rosbags import rosbag1, rosbag2
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from vertiwm_jax.importers.rosbag import DEFINITIONS
@@ -27,7 +28,12 @@ ROS1_GRID_MAP = """
 class Bag:
     """A bag to write to: `.bag` is of ROS 1, another name is the folder of one of ROS 2."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(
+        self,
+        path: Path,
+        store: StoragePlugin = StoragePlugin.SQLITE3,
+        compression: CompressionMode = CompressionMode.NONE,
+    ) -> None:
         self._is1 = path.suffix == ".bag"
         self.store = get_typestore(Stores.ROS1_NOETIC if self._is1 else Stores.ROS2_HUMBLE)
         texts = dict(DEFINITIONS)
@@ -36,8 +42,12 @@ class Bag:
             texts["grid_map_msgs/msg/GridMap"] = ROS1_GRID_MAP
         for kind, text in texts.items():
             self.store.register(get_types_from_msg(text, kind))
-        self._writer = rosbag1.Writer(path) if self._is1 else rosbag2.Writer(path, version=9)
-        self._connections = {}
+        if self._is1:
+            self._writer = rosbag1.Writer(path)
+        else:
+            self._writer = rosbag2.Writer(path, version=9, storage_plugin=store)
+            self._writer.set_compression(compression, CompressionFormat.ZSTD)
+        self._connections, self._latest = {}, {}
 
     def __enter__(self):
         self._writer.open()
@@ -55,15 +65,18 @@ class Bag:
         sequence = (0,) if self._is1 else ()
         return self.make("std_msgs/msg/Header", *sequence, time, frame)
 
-    def write(self, topic: str, received: float, message) -> None:
+    def write(self, topic: str, received: float, message, length: int | None = None) -> None:
+        """length: bytes that are left of a message that was cut off."""
         kind = message.__msgtype__
         if topic not in self._connections:
             connection = self._writer.add_connection(topic, kind, typestore=self.store)
             self._connections[topic] = connection
         serialize = self.store.serialize_ros1 if self._is1 else self.store.serialize_cdr
-        self._writer.write(
-            self._connections[topic], round(received * 1e9), serialize(message, kind)
-        )
+        data = bytes(serialize(message, kind))[:length]
+        # Stamps may fall back, the clock of the recorder does not.
+        received = max(received, self._latest.get(topic, 0.0) + 1e-3)
+        self._latest[topic] = received
+        self._writer.write(self._connections[topic], round(received * 1e9), data)
 
     def vector(self, xyz, kind: str = "Vector3"):
         return self.make(f"geometry_msgs/msg/{kind}", *(float(value) for value in xyz))
@@ -78,8 +91,8 @@ class Bag:
             self.vector(quaternion, "Quaternion"),
         )
 
-    def odometry(self, seen: Logged) -> None:
-        """All poses on `/odom`, received 0.03 s after their stamps."""
+    def odometry(self, seen: Logged, cut_off: int | None = None) -> None:
+        """All poses on `/odom`, received 0.03 s after their stamps; one may be cut off."""
         variance, rotation = np.zeros(36), seen.rotation.as_quat()
         for k, stamp in enumerate(seen.time):
             twist = self.twist(seen.state[k, 6:9], seen.state[k, 9:12])
@@ -94,7 +107,16 @@ class Bag:
                 ),
                 self.make("geometry_msgs/msg/TwistWithCovariance", twist, variance),
             )
-            self.write("/odom", stamp + 0.03, message)
+            self.write("/odom", stamp + 0.03, message, 60 if k == cut_off else None)
+
+    def poses(self, seen: Logged) -> None:
+        """The same on `/pose`, without velocities."""
+        variance, rotation = np.zeros(36), seen.rotation.as_quat()
+        for k, stamp in enumerate(seen.time):
+            pose = self.pose(seen.position[k], rotation[k])
+            known = self.make("geometry_msgs/msg/PoseWithCovariance", pose, variance)
+            kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
+            self.write("/pose", stamp + 0.03, self.make(kind, self.header(stamp, "map"), known))
 
     def ackermann(self, time, command) -> None:
         """Stamped commands on `/cmd`."""

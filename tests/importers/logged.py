@@ -73,9 +73,13 @@ class Logged:
 
 
 def logged(
-    seconds: float = 20.0, rate: float = 50.0, noise: float = 0.0, start: float = 100.0
+    seconds: float = 20.0,
+    rate: float = 50.0,
+    noise: float = 0.0,
+    start: float = 100.0,
+    even: bool = False,
 ) -> Logged:
-    """Stamps jitter by a third of their distance, and one in ten is dropped.
+    """Stamps jitter by a third of their distance, and one in ten is dropped, unless they are even.
 
     noise: how many times `POSITION_NOISE` and `ANGLE_NOISE`.
     """
@@ -85,6 +89,8 @@ def logged(
     time = start + (np.arange(count) + jitter) / rate
     dropped = rng.random(count) < 0.1
     dropped[[0, -1]] = False
+    if even:
+        time, dropped = start + np.arange(count) / rate, np.zeros(count, bool)
     time = time[~dropped]
     state = states(time)
     error = noise * rng.normal(size=(len(time), 6))
