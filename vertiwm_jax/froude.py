@@ -19,7 +19,7 @@ POWER: dict[str, float] = {
     # Of a soil: its stresses grow as its depths do. For Bekker's moduli see `scaled`.
     "cohesion": 1, "shear_modulus": 1,
     # Of a map.
-    "elevation": 1, "obstacles": 1, "origin": 1, "resolution": 1,
+    "elevation": 1, "obstacles": 1, "origin": 1, "resolution": 1, "middles": 1,
 }  # fmt: skip
 """The power of the factor by which each quantity grows."""
 
@@ -36,5 +36,12 @@ def scaled(quantities: Quantities, factor: float) -> Quantities:
             power = (2 if name == "kc" else 1) - vars(quantities)["n"]
             changes[name] = value * factor**power
         elif name in POWER:
-            changes[name] = value * factor ** POWER[name]
+            changes[name] = _times(value, factor ** POWER[name])
     return replace(cast(Any, quantities), **changes)
+
+
+def _times(value: Any, factor: float) -> Any:
+    """A number, an array, or a tuple of such, times the factor."""
+    if isinstance(value, tuple):
+        return tuple(_times(x, factor) for x in value)
+    return value * factor

@@ -95,3 +95,21 @@ def test_everything_is_written(groups, tmp_path):
     first = rows[0]
     assert (first["suite"], first["policy"], first["world"]) == ("hard", "learned", "0")
     assert (first["ending"], first["seconds"], first["driven_m"]) == ("goal", "1.0", "5.0")
+
+
+def test_far_worlds_are_told_as_in_their_files(groups, tmp_path):
+    places = [(0.0, 0.0), (512345.0, 5234567.0), (312345.0, 4234567.0)]
+    corners = np.array(places) + [-32, 32]
+    classes = np.zeros((8, 8), int)
+    levels = [TerrainMap.from_array(np.zeros((65, 65)), classes, origin=xy) for xy in corners]
+    terrain = terrain_map.stack(levels)
+    report.write(tmp_path, groups, terrain, 8.0)
+    with (tmp_path / "episodes.csv").open() as file:
+        for row in csv.DictReader(file):
+            assert (float(row["goal_x"]), float(row["goal_y"])) == places[int(row["world"])]
+    figure = terrain.plot()
+    figure.draw_without_rendering()
+    for axes, (x, y) in zip(figure.axes, places, strict=False):
+        for axis, middle in ((axes.xaxis, x), (axes.yaxis, y)):
+            told = {label.get_text().replace("\N{MINUS SIGN}", "-") for label in axis.get_ticklabels()}
+            assert f"{middle:.10g}" in told

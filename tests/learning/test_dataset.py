@@ -87,6 +87,32 @@ def test_half_a_recording_is_refused(tmp_path):
     assert str(caught.value).startswith(f"{path}: ")
 
 
+def far_away(folder, state):
+    path = write(folder, state=state)
+    hill = TerrainMap.from_array(np.ones((9, 9)), np.full((4, 4), GRASS), origin=(5e5, 5e6))
+    files.save(hill, folder / "maps" / "hill.npz")
+    return path
+
+
+def test_drives_on_a_far_map_are_brought_to_its_coordinates(tmp_path):
+    near, place = drives()["state"], np.pad([5e5 + 4, 5e6 - 4], (0, 10))
+    path = far_away(tmp_path, near + place)
+    found, terrain = dataset.load_file(path)
+    assert found.state.dtype == np.float32
+    np.testing.assert_allclose(found.state, near, atol=1e-6)
+    np.testing.assert_array_equal(terrain.offset(), place[:2])
+    rounded = (near + place).astype(np.float32)
+    for state, message in (
+        (rounded, r"state: expected float64, because .* about \(500004, 4999996\) m, found float32"),
+        (near.astype(float), r"state: expected finite position in m within 1e\+05"),
+        (near + place + np.pad([2e3, 0], (0, 10)), r"state: expected positions on its map, x from "
+            r"500000 to 500008 m and y .*, found none, the first is \(502004, 4999996\)"),
+    ):  # fmt: skip
+        far_away(tmp_path, state)
+        with pytest.raises(DataError, match=r"a\.npz: " + message):
+            dataset.load_file(path)
+
+
 def test_precision_in_the_file_does_not_matter(tmp_path):
     write(tmp_path, "a.npz", state=drives()["state"].astype(np.float64))
     write(tmp_path, "b.npz", state=drives()["state"].astype(np.float16))

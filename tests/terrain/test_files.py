@@ -86,6 +86,24 @@ def test_save_and_load_round_trip(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "b.npz"]
 
 
+def test_a_far_map_is_saved_as_it_was_given(tmp_path):
+    origin, boxes = np.array([512345.1, 5234567.7]), np.array([[512350.3, 5234560.9, 1, 2, 3]])
+    heights = np.ones((1001, 1001))
+    far = TerrainMap.from_array(heights, origin=origin, resolution=0.1, obstacles=boxes)
+    for name in ("a.npz", "b.npz"):
+        files.save(far, tmp_path / name)
+        with np.load(tmp_path / name) as file:
+            np.testing.assert_allclose(file["origin"], origin, rtol=0, atol=1e-8)
+            np.testing.assert_allclose(file["obstacles"], boxes, rtol=0, atol=1e-5)
+        again = files.load_map(tmp_path / name)
+        assert_same(again, far)
+        np.testing.assert_allclose(again.offset(), far.offset(), rtol=0, atol=1e-8)
+        far = again
+    large = files.load_map(tmp_path / "b.npz", scale=10.0)
+    np.testing.assert_allclose(large.offset(), 10 * far.offset(), rtol=1e-12)
+    np.testing.assert_allclose(large.origin, [-500, 500], rtol=1e-6)
+
+
 def test_save_keeps_the_selected_world_and_classes_of_ones_own(tmp_path):
     classes = GroundClasses(
         names=("regolith", "plate"),

@@ -105,6 +105,43 @@ def test_a_map_of_an_array_may_be_oblong_and_high_above_the_sea():
         TerrainMap.from_array(heights, "lava")
 
 
+UTM = 512345.25, 5234567.5
+
+
+def test_positions_on_a_far_map_are_counted_from_its_middle():
+    x, y = UTM
+    box = [x + 3.25, y - 12.5, 1, 2, 3]
+    far = build(origin=UTM, obstacles=[box, np.zeros(5)])
+    near = build(origin=(-8, 8), obstacles=[[-4.75, -4.5, 1, 2, 3], np.zeros(5)])
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(far), jax.tree.leaves(near))
+    assert far.offset().tolist() == [x + 8, y - 8] and near.offset().tolist() == [0, 0]
+    assert near.offset(np.zeros((2, 3), int)).shape == (2, 3, 2)
+    # Nothing that is traced sees it.
+    add_up = str(jax.make_jaxpr(lambda terrain: query.height(terrain, jnp.zeros(2)))(far))
+    assert add_up == str(jax.make_jaxpr(lambda terrain: query.height(terrain, jnp.zeros(2)))(near))
+    with pytest.raises(MapError, match=r"obstacles: expected centers within x 512345 to"):
+        build(origin=UTM, obstacles=[[0, 0, 1, 1, 1]])
+
+
+def test_a_map_is_far_where_float32_does_not_resolve_it():
+    for origin in ((900.0, -900.0), (-1000.0, 8.0)):
+        assert not build(origin=origin).middles and build(origin=origin).origin[0] == origin[0]
+    assert build(origin=(1000.0, 8.0)).middles == ((1008.0, 0.0),)
+
+
+def test_far_worlds_of_several_places_are_stacked():
+    home, away = build(origin=UTM), build(origin=(UTM[0] + 100, UTM[1]))
+    centered = build(elevation=np.zeros((17, 17)))
+    stacked = terrain_map.stack([home, terrain_map.stack([centered, away])])
+    middle = np.array(UTM) + [8, -8]
+    expected = [middle, np.zeros(2), middle + [100, 0]]
+    np.testing.assert_array_equal(stacked.offset(np.arange(3)), expected)
+    np.testing.assert_array_equal(stacked.select(jnp.int32(2)).offset(), expected[2])
+    np.testing.assert_array_equal(stacked.subset(np.array([2, 1])).offset([0, 1]), expected[:0:-1])
+    some = stacked.subset(np.array([True, False, True]))
+    np.testing.assert_array_equal(some.offset([0, 1]), expected[::2])
+
+
 def test_stack_joins_worlds_and_pads_obstacles():
     first = build(elevation=np.zeros((17, 17)))
     second = build(obstacles=[[1, 2, 3, 4, 5]])

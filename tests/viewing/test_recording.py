@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -65,6 +67,12 @@ def test_all_of_the_scene_is_there(found):
     assert len(drawn) == sum(map(len, panels(full).values()))
     speed = entities["plots/speed\\ \\[m\\/s\\]/commanded"]["Scalars:scalars"]
     np.testing.assert_allclose(np.squeeze(speed)[:-1], full.command[:, 0])
+
+
+def test_a_far_scene_tells_where_it_is(tmp_path):
+    far = replace(bare(), terrain=replace(bare().terrain, middles=((512345.5, 5234567.0),)))
+    recording.write(far, tmp_path / "far.rrd")
+    assert b"positions are counted from (512345.5, 5234567)" in (tmp_path / "far.rrd").read_bytes()
 
 
 def test_a_drive_alone(tmp_path):

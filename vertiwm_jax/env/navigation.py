@@ -111,7 +111,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
                 i = int(np.argmin(finite))
                 raise TaskError(
                     f"dynamics: expected a finite state after {config.settle_steps} steps of "
-                    f"standing still, found {states[i]}; {tasks.told(i)}; {np.sum(~finite)} of "
+                    f"standing still, found {states[i]}; {tasks.told(i, terrain)}; {np.sum(~finite)} of "
                     f"{pool} tasks are so"
                 )
         else:

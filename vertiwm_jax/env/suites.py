@@ -48,7 +48,7 @@ class TaskError(UserError, ValueError):
 
 @struct.dataclass
 class Tasks:
-    """P tasks on W stacked worlds.
+    """P tasks on W stacked worlds, in the coordinates of their map (see `TerrainMap.offset`).
 
     world: `[P]` int32.
     start: `[P, 2]` x, y, m.
@@ -61,10 +61,14 @@ class Tasks:
     yaw: jax.Array
     goal: jax.Array
 
-    def told(self, i: int) -> str:
-        """Task i in words."""
+    def told(self, i: int, terrain: TerrainMap) -> str:
+        """Task i on its map in words."""
         world, start, yaw, goal = (np.asarray(x)[i].tolist() for x in vars(self).values())
-        return f"task {i} has world {world}, start {start}, goal {goal}, yaw {yaw:g}"
+        told = f"task {i} has world {world}, start {start}, goal {goal}, yaw {yaw:g}"
+        if terrain.middles:
+            x, y = terrain.middles[min(max(world, 0), terrain.worlds - 1)]
+            told += f", counted from the middle of the map, {x:.10g}, {y:.10g}"
+        return told
 
 
 @settings
@@ -290,4 +294,4 @@ def validate(tasks: Tasks, terrain: TerrainMap, goal_radius: float, margin: floa
     }
     for message, bad in checks.items():
         if bad.any():
-            raise TaskError(f"tasks.{message}; {tasks.told(int(np.argmax(bad)))}")
+            raise TaskError(f"tasks.{message}; {tasks.told(int(np.argmax(bad)), terrain)}")

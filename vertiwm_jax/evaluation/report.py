@@ -236,7 +236,7 @@ def write(
     texts = {
         "summary.md": markdown(groups) + "\n",
         "summary.json": json.dumps(summary(groups), indent=2) + "\n",
-        "episodes.csv": tables.csv_text(_episodes(groups)),
+        "episodes.csv": tables.csv_text(_episodes(groups, terrain)),
     }
     tables.write(folder, texts | drawn)
 
@@ -270,15 +270,15 @@ def summary(groups: Mapping[str, Results]) -> dict[str, dict[str, dict[str, Any]
     return found
 
 
-def _episodes(groups: Mapping[str, Results]) -> list[tables.Row]:
-    """A row for each episode."""
+def _episodes(groups: Mapping[str, Results], terrain: TerrainMap) -> list[tables.Row]:
+    """A row for each episode, in the coordinates of the file of its map."""
     return [
         {
             "suite": suite,
             "policy": policy,
             "world": int(result.world[i]),
-            "goal_x": float(result.goal[i, 0]),
-            "goal_y": float(result.goal[i, 1]),
+            "goal_x": float(result.goal[i, 0] + terrain.offset(result.world[i])[0]),
+            "goal_y": float(result.goal[i, 1] + terrain.offset(result.world[i])[1]),
             "ending": TerminationReason(int(result.ending[i])).name.lower(),
             "seconds": round(float(result.seconds[i]), 1),
             "abs_roll_deg": math.degrees(float(result.abs_roll[i])),

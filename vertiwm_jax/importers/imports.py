@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -80,7 +81,7 @@ def import_drives(
         meta = {"sources": [str(source) for source in sources], "map": "map.npz"}
         wheels = settings.vehicle.wheels_in_body_xy
         for number, first in enumerate(range(0, len(drives), PER_FILE)):
-            some = _arrays(drives[first : first + PER_FILE])
+            some = schema.in_file(_arrays(drives[first : first + PER_FILE]), terrain.offset())
             schema.write(unfinished / f"drives_{number:03d}.npz", some, meta, wheels)
     remarks += _remarks(drives, terrain, settings.vehicle.scale)
     return "\n".join([markdown(rows), "", *said, *remarks])
@@ -124,7 +125,9 @@ def _import(
     scale = settings.vehicle.scale
     drives, left_out = list[Drive](), Counter[str]()
     point = scale * np.asarray(settings.vehicle.logged_point)
+    offset = np.append(terrain.offset(), 0)
     for log in logs:
+        log = replace(log, position=log.position - offset)
         found, short = resampling.resample(log, settings.resampling, point)
         drives += found
         left_out += short

@@ -122,12 +122,30 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], TerrainMap]:
     """The arrays of all drives of a file and its map."""
     arrays, meta = schema.read(path)
     terrain = files.load_map(schema.find_map(path, meta["map"]))
+    arrays = schema.check(path, arrays, terrain.offset())
+    _check_place(path, arrays, terrain)
     if "wheel_class" not in arrays:
         wheels = np.asarray(meta["vehicle"]["wheels_in_body_xy"], np.float32)
         arrays["wheel_class"] = _look_up_classes(terrain, arrays["state"], wheels)
     schema.check_classes(path, arrays["wheel_class"], len(terrain.class_names))
     kinds = {"length": np.int32, "wheel_class": np.uint8}
     return arrays | {name: arrays[name].astype(kind) for name, kind in kinds.items()}, terrain
+
+
+def _check_place(path: Path, arrays: dict[str, np.ndarray], terrain: TerrainMap) -> None:
+    """Raises `DataError` where all positions are off the map: their coordinates are others."""
+    steps = np.arange(arrays["state"].shape[1])
+    xy = arrays["state"][steps <= arrays["length"][:, None], :2]
+    low, high = map(np.asarray, terrain.extent)
+    if not ((xy >= low) & (xy <= high)).all(axis=1).any():
+        offset = terrain.offset()
+        (west, south), (east, north) = low + offset, high + offset
+        x, y = xy[0] + offset
+        raise DataError(
+            f"{path}: state: expected positions on its map, x from {west:.10g} to {east:.10g} m "
+            f"and y from {south:.10g} to {north:.10g} m, found none, the first is "
+            f"({x:.10g}, {y:.10g})"
+        )
 
 
 def _look_up_classes(terrain: TerrainMap, state: np.ndarray, wheels: np.ndarray) -> np.ndarray:

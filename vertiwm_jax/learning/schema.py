@@ -19,7 +19,8 @@ and, as far as they were recorded (wheels in the order FL, FR, RL, RR),
     steer_angle    [K, T + 1, 2]     front-left and front-right wheel, rad
 
 Numbers may be of any precision. Arrays of other names are not read. Maps lie in a folder `maps`
-inside the collection or beside it.
+inside the collection or beside it. Positions are in the coordinates of the map's file: where these
+are large, as those of UTM are, in float64.
 """
 
 import io
@@ -74,9 +75,10 @@ class DataError(UserError, ValueError):
 
 
 def read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays of a file that the schema names, numbers in float32, and its meta.
+    """The arrays of a file that the schema names, as they are stored, and its meta.
 
-    Raises `DataError` unless all of it can be used. Class ids need the map: see `check_classes`.
+    Raises `DataError` unless they are there. What they hold needs the map: see `check` and
+    `check_classes`.
     """
     expected = f"{path}: expected an .npz archive of plain arrays"
     refused = refusing(lambda found: DataError(f"{expected}: {found}"))
@@ -86,7 +88,7 @@ def read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if missing:
         raise DataError(f"{path}: missing {', '.join(missing)}; found {list(found)}")
     meta = str(found.pop("meta"))
-    return check(path, found), _parse(path, meta, "wheel_class" in found)
+    return found, _parse(path, meta, "wheel_class" in found)
 
 
 def vehicle_name(path: Path) -> str:
@@ -125,12 +127,20 @@ def join(parts: Sequence[Mapping[str, np.ndarray]], steps: int = 0) -> dict[str,
     return {name: np.concatenate([filled(name, part[name]) for part in parts]) for name in parts[0]}
 
 
+def in_file(arrays: Mapping[str, np.ndarray], offset: np.ndarray) -> Mapping[str, np.ndarray]:
+    """The same with positions as in the file of the map; offset: `TerrainMap.offset` of it."""
+    if not offset.any():
+        return arrays
+    return {**arrays, "state": arrays["state"] + np.pad(offset, (0, 10))}
+
+
 def write(
     path: Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], wheels: ArrayLike
 ) -> None:
     """Writes a file, whole or not at all.
 
-    meta: holds "map", the file name of the terrain map. wheels: `[4, 2]` x, y in the body, m.
+    arrays: with positions as in the file of the map, see `in_file`. meta: holds "map", the name of
+    that file. wheels: `[4, 2]` x, y in the body, m.
     """
     vehicle = {"wheels_in_body_xy": np.asarray(wheels).tolist()}
     text = json.dumps({**meta, "dt": STEP_SECONDS, "vehicle": vehicle})
@@ -159,10 +169,13 @@ def find_map(path: Path, name: str) -> Path:
     raise DataError(f"{path}: meta: its map {name} was expected at {places[0]} or {places[1]}")
 
 
-def check(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def check(
+    path: Path, arrays: dict[str, np.ndarray], offset: np.ndarray = np.zeros(2)
+) -> dict[str, np.ndarray]:
     """Arrays of the schema, numbers in float32; raises `DataError`, which names `path`.
 
-    They have to be of the right shape, finite where they are valid, and in SI units.
+    They have to be of the right shape, finite where they are valid, and in SI units. offset:
+    `TerrainMap.offset` of their map, which is taken off the positions.
     """
     if arrays["control"].ndim != 3:
         found = list(arrays["control"].shape)
@@ -186,6 +199,14 @@ def check(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     length = arrays["length"]
     if not np.issubdtype(length.dtype, np.integer) or length.min() < 0 or length.max() > steps:
         raise DataError(f"{path}: length: expected integers in 0 to {steps}, found {length}")
+    if offset.any():
+        if arrays["state"].dtype.kind == "f" and arrays["state"].dtype.itemsize < 8:
+            x, y = offset
+            raise DataError(
+                f"{path}: state: expected float64, because positions on its map are about "
+                f"({x:.10g}, {y:.10g}) m, found {arrays['state'].dtype}"
+            )
+        arrays = arrays | {"state": arrays["state"] - np.pad(offset, (0, 10))}
     arrays = arrays | {name: arrays[name].astype(np.float32) for name in _FLOATS if name in arrays}
     valid = np.arange(steps + 1) <= length[:, None]
     for name, columns, limit, meaning in _LIMITS:

@@ -112,7 +112,8 @@ def collect(config: CollectConfig) -> None:
     tasks = (
         (alone, world, number)
         for world in missing
-        for alone in [jax.device_get(terrain.subset(np.array([world])))]
+        # Without its place, by which it would be compiled anew.
+        for alone in [jax.device_get(replace(terrain.subset(np.array([world])), middles=()))]
         for number in range(config.drives)
     )
     total = len(missing) * config.drives * config.steps
@@ -138,7 +139,8 @@ def collect(config: CollectConfig) -> None:
             }
             # Last, because by its file a world counts as done.
             wheels = driven.vehicle.wheel_position
-            schema.write(path, arrays(drives, config.steps), meta, wheels)
+            recorded = schema.in_file(arrays(drives, config.steps), terrain.offset(world))
+            schema.write(path, recorded, meta, wheels)
     if done:
         _log.info("%s steps, %.0f a second", f"{done:,}", done / (time.monotonic() - began))
 

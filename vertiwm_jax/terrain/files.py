@@ -71,7 +71,9 @@ def save(terrain: TerrainMap, path: str | Path) -> None:
     Raises `WriteError` where that is not possible.
     """
     world, deformable = int(terrain.world), np.asarray(terrain.deformable)
-    semantic, obstacles = np.asarray(terrain.semantic[world]), np.asarray(terrain.obstacles[world])
+    semantic, offset = np.asarray(terrain.semantic[world]), terrain.offset()
+    obstacles = np.asarray(terrain.obstacles[world], np.float64)
+    obstacles = obstacles[(obstacles != 0).any(axis=1)] + [*offset, 0, 0, 0]
     of_class = query.soils(terrain)
     soils = {
         name: soil_of_chrono(of_class, k)
@@ -84,11 +86,11 @@ def save(terrain: TerrainMap, path: str | Path) -> None:
         stream,
         elevation=terrain.elevation[world],
         resolution=terrain.resolution,
-        origin=terrain.origin,
+        origin=np.asarray(terrain.origin, np.float64) + offset,
         class_rgb=terrain.class_rgb,
         patch_class=semantic,
         patch_friction=np.where(deformable[semantic], np.float32(np.nan), terrain.friction[world]),
-        obstacles=obstacles[(obstacles != 0).any(axis=1)],
+        obstacles=obstacles,
         meta=np.array(json.dumps(meta)),
     )
     atomic.write(path, stream.getvalue())

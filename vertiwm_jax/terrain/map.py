@@ -31,6 +31,9 @@ class MapError(UserError, ValueError):
 
 BY_WORLD = ("elevation", "semantic", "friction", "obstacles")
 """The arrays of a map of which each world has its own."""
+FAR = 1e3
+"""Distance, m, of the middle of a map from x = y = 0 beyond which positions are counted from it:
+within it, float32 resolves a tenth of a millimeter."""
 
 
 @struct.dataclass
@@ -71,6 +74,8 @@ class TerrainMap:
     grip: `[]` factor on all friction; None for 1.
     observed: what a vehicle knows of the selected world, which queries then answer from; None for
         all.
+    middles: x, y of the middle of each world in the coordinates of its file, m, static: positions
+        are counted from there, see `offset`. Empty where they are as in the file.
     """
 
     elevation: jax.Array
@@ -86,6 +91,22 @@ class TerrainMap:
     class_names: tuple[str, ...] = struct.field(pytree_node=False)
     grip: jax.Array | None = None
     observed: ObservedMap | None = None
+    middles: tuple[tuple[float, float], ...] = struct.field(pytree_node=False, default=())
+
+    def offset(self, world: ArrayLike | None = None) -> np.ndarray:
+        """x, y in the coordinates of the map's file of what is 0, 0 in those of this map, m.
+
+        Maps of UTM coordinates are so large that float32 does not resolve them, so positions here
+        are counted from the middle of such a world. Add this to the x, y of a position to have it
+        in the file's coordinates, and subtract it from theirs, in float64.
+
+        world: `[...]` numbers of worlds; the selected one by default.
+
+        Returns:
+            `[..., 2]` float64; 0 where both are the same.
+        """
+        chosen = np.asarray(self.world if world is None else world)
+        return np.array(self.middles or [(0.0, 0.0)] * self.worlds)[chosen]
 
     @property
     def worlds(self) -> int:
@@ -133,9 +154,11 @@ class TerrainMap:
                 westernmost.
             classes: `[r, c]` class ids of cells over the same extent, or the name of one class.
             resolution: m between vertices.
-            origin: x, y of vertex (0, 0), m; the map is centered by default.
+            origin: x, y of vertex (0, 0), m, at any distance, in float64; the map is centered by
+                default.
             friction: `[r, c]` coefficients; the mean of each class by default, ignored on soil.
             obstacles: `[N, 5]` center x, y, size x, size y and height, m; none by default.
+                Their places are in the coordinates of `origin`.
             ground: the classes of ground that ids and names refer to.
             name: what errors call the map.
 
@@ -152,11 +175,11 @@ class TerrainMap:
         check("elevation", good, expected, heights, "fill the holes")
         check("resolution", 0 < resolution < np.inf, "meters between vertices, > 0", resolution)
         height, width = (resolution * (n - 1) for n in shape)
-        corner = np.asarray((-width / 2, height / 2) if origin is None else origin, np.float32)
-        # Farther away, float32 does not resolve centimeters.
-        good = corner.shape == (2,) and (np.abs(corner) < 1e5).all()
-        expected = "finite x, y, less than 100 km"
-        check("origin", good, expected, corner, "count them from a point on the map")
+        centered = np.array([-width / 2, height / 2], np.float32)
+        corner = np.asarray(centered if origin is None else origin, np.float64)
+        # Coordinates on Earth are no larger.
+        good = corner.shape == (2,) and (np.abs(corner) < 1e8).all()
+        check("origin", good, "finite x, y in m", corner)
 
         if isinstance(classes, str):
             expected = f"one of {', '.join(ground.names)}"
@@ -184,28 +207,36 @@ class TerrainMap:
         check("friction", friction.shape == soft.shape, f"shape {soft.shape}", friction.shape)
         good = soft | (friction > 0) & np.isfinite(friction)
         check("friction", good, "numbers > 0 on rigid ground", friction)
-        boxes = np.zeros((0, 5)) if obstacles is None else np.asarray(obstacles)
+        boxes = np.zeros((0, 5)) if obstacles is None else np.asarray(obstacles, np.float64)
         check("obstacles", boxes.shape[1:] == (5,), "shape (any, 5)", boxes.shape)
         check("obstacles", np.isfinite(boxes), "finite numbers", boxes)
         check("obstacles", boxes[:, 2:] >= 0, "sizes and heights >= 0", boxes[:, 2:])
         low, high = corner - [0, height], corner + [width, 0]
         unused = ~boxes.any(axis=1, keepdims=True)
         good = unused | (boxes[:, :2] >= low) & (boxes[:, :2] <= high)
-        expected = f"centers within x {low[0]:g} to {high[0]:g}, y {low[1]:g} to {high[1]:g}"
+        expected = (
+            f"centers within x {low[0]:.10g} to {high[0]:.10g}, "
+            f"y {low[1]:.10g} to {high[1]:.10g}"
+        )
         check("obstacles", good, expected, boxes[:, :2])
+        middle = corner - centered
+        far = bool((np.abs(middle) > FAR).any())
+        if far:
+            corner, boxes = centered, np.where(unused, 0, boxes - [*middle, 0, 0, 0])
 
         return TerrainMap(
             elevation=jnp.asarray(heights[None]),
             semantic=jnp.asarray(semantic[None], jnp.uint8),
             friction=jnp.asarray(np.where(soft, 0, friction)[None], jnp.float32),
             obstacles=jnp.asarray(boxes[None], jnp.float32),
-            origin=jnp.asarray(corner),
+            origin=jnp.asarray(corner, jnp.float32),
             resolution=jnp.float32(resolution),
             class_rgb=jnp.asarray(ground.rgb, jnp.uint8),
             deformable=jnp.asarray(ground.deformable),
             soils=jax.tree.map(lambda leaf: leaf[None], ground.stacked_soils()),
             world=jnp.int32(0),
             class_names=ground.names,
+            middles=(tuple(middle.tolist()),) if far else (),
         )
 
     def select(self, world: jax.Array) -> Self:
@@ -217,6 +248,9 @@ class TerrainMap:
         changes = {name: getattr(self, name)[worlds] for name in BY_WORLD}
         if len(self.soils.n) > 1:
             changes["soils"] = jax.tree.map(lambda leaf: leaf[worlds], self.soils)
+        if self.middles:
+            numbers = np.arange(self.worlds)[worlds]
+            changes["middles"] = tuple(self.middles[i] for i in numbers)
         return replace(self, **changes, world=jnp.int32(0))
 
     def with_soils(self, soils: Soil) -> Self:
@@ -228,8 +262,9 @@ class TerrainMap:
 def stack(maps: Sequence[TerrainMap], names: Sequence[str] | None = None) -> TerrainMap:
     """Concatenates worlds of maps of equal extent, classes and scale; world 0 is selected.
 
-    Soils may differ. Obstacle lists are padded to the longest. Raises `MapError` naming the first
-    map that differs (by `names`, or its place) and the field.
+    Soils may differ, and so may places of which positions are counted from the middle. Obstacle
+    lists are padded to the longest. Raises `MapError` naming the first map that differs (by
+    `names`, or its place) and the field.
     """
     if not maps:
         raise MapError("stack", "maps", "at least one map", "none")
@@ -252,6 +287,10 @@ def stack(maps: Sequence[TerrainMap], names: Sequence[str] | None = None) -> Ter
     if all(np.allclose(x, x[:1]) for x in jax.tree.leaves(soils)):
         soils = jax.tree.map(lambda x: x[:1], soils)
     stacked = {name: of_all(name) for name in BY_WORLD}
+    if any(m.middles for m in maps):
+        stacked["middles"] = tuple(
+            (x, y) for m in maps for x, y in m.offset(np.arange(m.worlds)).tolist()
+        )
     return replace(maps[0], **stacked, soils=soils, world=jnp.int32(0))
 
 

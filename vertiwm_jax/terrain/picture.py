@@ -87,9 +87,14 @@ def plot(terrain: TerrainMap, names: Sequence[str] | None = None, most: int = 12
 
 
 def draw_map(axes: Axes, terrain: TerrainMap, world: int, title: str) -> None:
-    """Draws one world into a panel."""
+    """Draws one world into a panel: in its own coordinates, with those of its file at the axes."""
     axes.imshow(shaded(terrain, world), extent=extent(terrain))
     axes.grid(False)
+    offset = terrain.offset(world)
+    if offset.any():
+        for axis, first in zip((axes.xaxis, axes.yaxis), offset.tolist(), strict=True):
+            axis.set_major_formatter(lambda place, _, first=first: f"{first + place:.10g}")
+        axes.locator_params(nbins=3)  # Such numbers are long.
     axes.set(xlabel="x [m], east", ylabel="y [m], north", title=title)
 
 

@@ -33,7 +33,10 @@ def _layout(scene: Scene) -> rrb.Blueprint:
     start, yaw = scene.state[0, :3], scene.state[0, 5]
     eye = start + np.array([-12 * np.cos(yaw), -12 * np.sin(yaw), 7.0])
     controls = rrb.EyeControls3D(position=eye, look_target=start, tracking_entity="world/vehicle")
-    world = rrb.Spatial3DView(origin="world", name=scene.title, eye_controls=controls)
+    name, (x, y) = scene.title, scene.terrain.offset(scene.world)
+    if scene.terrain.middles:
+        name += f"; positions are counted from ({x:.10g}, {y:.10g})"
+    world = rrb.Spatial3DView(origin="world", name=name, eye_controls=controls)
     over_time = [
         rrb.TimeSeriesView(origin=_entity("plots", title), name=title) for title in panels(scene)
     ]
