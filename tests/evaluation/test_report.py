@@ -111,5 +111,7 @@ def test_far_worlds_are_told_as_in_their_files(groups, tmp_path):
     figure.draw_without_rendering()
     for axes, (x, y) in zip(figure.axes, places, strict=False):
         for axis, middle in ((axes.xaxis, x), (axes.yaxis, y)):
-            told = {label.get_text().replace("\N{MINUS SIGN}", "-") for label in axis.get_ticklabels()}
+            told = {
+                label.get_text().replace("\N{MINUS SIGN}", "-") for label in axis.get_ticklabels()
+            }
             assert f"{middle:.10g}" in told

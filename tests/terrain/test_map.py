@@ -119,7 +119,7 @@ def test_positions_on_a_far_map_are_counted_from_its_middle():
     # Nothing that is traced sees it.
     add_up = str(jax.make_jaxpr(lambda terrain: query.height(terrain, jnp.zeros(2)))(far))
     assert add_up == str(jax.make_jaxpr(lambda terrain: query.height(terrain, jnp.zeros(2)))(near))
-    with pytest.raises(MapError, match=r"obstacles: expected centers within x 512345 to"):
+    with pytest.raises(MapError, match=r"obstacles: expected centers within x 512345.25 to"):
         build(origin=UTM, obstacles=[[0, 0, 1, 1, 1]])
 
 

@@ -111,8 +111,8 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
                 i = int(np.argmin(finite))
                 raise TaskError(
                     f"dynamics: expected a finite state after {config.settle_steps} steps of "
-                    f"standing still, found {states[i]}; {tasks.told(i, terrain)}; {np.sum(~finite)} of "
-                    f"{pool} tasks are so"
+                    f"standing still, found {states[i]}; {tasks.told(i, terrain)}; "
+                    f"{np.sum(~finite)} of {pool} tasks are so"
                 )
         else:
             # As they will settle, so that it is traced only once.

@@ -215,8 +215,7 @@ class TerrainMap:
         unused = ~boxes.any(axis=1, keepdims=True)
         good = unused | (boxes[:, :2] >= low) & (boxes[:, :2] <= high)
         expected = (
-            f"centers within x {low[0]:.10g} to {high[0]:.10g}, "
-            f"y {low[1]:.10g} to {high[1]:.10g}"
+            f"centers within x {low[0]:.10g} to {high[0]:.10g}, y {low[1]:.10g} to {high[1]:.10g}"
         )
         check("obstacles", good, expected, boxes[:, :2])
         middle = corner - centered
