@@ -7,7 +7,7 @@ writes a CSV log a world, with the maps and the settings by which `import_drives
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -78,6 +78,8 @@ def make_logs(
         (unfinished / "maps").mkdir()
         for source in sources:
             arrays, meta = schema.read(source)
+            terrain = files.load_map(schema.find_map(source, meta["map"]))
+            arrays = schema.check(source, arrays, terrain.offset())
             rows = []
             for number, length in enumerate(arrays["length"]):
                 state = arrays["state"][number, : length + 1]
@@ -89,8 +91,8 @@ def make_logs(
             head = {"header": ",".join(COLUMNS), "comments": ""}
             file = unfinished / f"{source.stem}.csv"
             np.savetxt(file, np.concatenate(rows), kinds, ",", **head)
-            terrain = files.load_map(schema.find_map(source, meta["map"]))
-            small = froude.scaled(terrain, 1 / driven.scale)
+            # Log and map both count positions from the middle of the map.
+            small = froude.scaled(replace(terrain, middles=()), 1 / driven.scale)
             files.save(small, unfinished / "maps" / source.name)
         configuration.save(_settings(driven), unfinished / "settings.yaml")
     seconds = samples / (1 - noise.dropped) / noise.rate

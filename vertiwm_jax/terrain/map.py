@@ -285,11 +285,10 @@ def stack(maps: Sequence[TerrainMap], names: Sequence[str] | None = None) -> Ter
     soils = jax.tree.map(lambda *x: jnp.concatenate(x), *map(_soils_by_world, maps))
     if all(np.allclose(x, x[:1]) for x in jax.tree.leaves(soils)):
         soils = jax.tree.map(lambda x: x[:1], soils)
-    stacked = {name: of_all(name) for name in BY_WORLD}
+    stacked: dict[str, Any] = {name: of_all(name) for name in BY_WORLD}
     if any(m.middles for m in maps):
-        stacked["middles"] = tuple(
-            (x, y) for m in maps for x, y in m.offset(np.arange(m.worlds)).tolist()
-        )
+        offsets = np.concatenate([m.offset(np.arange(m.worlds)) for m in maps])
+        stacked["middles"] = tuple(map(tuple, offsets.tolist()))
     return replace(maps[0], **stacked, soils=soils, world=jnp.int32(0))
 
 
