@@ -45,13 +45,13 @@ from vertiwm_jax.terrain.map import TerrainMap
 TABLE = """
 defect                    csv      parquet  bag      db3      mcap     chunks   db3.zstd mcap.zstd
 none                      read     read     read     read     read     read     read     read
-file named directly       read     read     read     read     read     read     read!    read!
-folder without notes      read!    read!    read!    read!    read!    read!    read!    read!
+file named directly       read     read     read     read     read     read     read     read
+folder without notes      read     read     read     read     read     read     read     read
 blank line                read     -        -        -        -        -        -        -
-bad row or message        told     -        told!    told!    told!    told!    told!    told!
+bad row or message        told     -        told     told     told     told     told     told
 not a number              told     told     told     told     told     told     told     told
-a leap and back           cut!     cut!     cut!     cut!     cut!     cut!     cut!     cut!
-a leap that stays         cut!     cut!     cut!     cut!     cut!     cut!     cut!     cut!
+a leap and back           cut      cut      cut      cut      cut      cut      cut      cut
+a leap that stays         cut      cut      cut      cut      cut      cut      cut      cut
 one pose alone            cut      cut      cut      cut      cut      cut      cut      cut
 duplicated stamp          told     told     told     told     told     told     told     told
 swapped stamps            told     told     told     told     told     told     told     told
@@ -70,9 +70,9 @@ commands act late         told!    told!    told!    told!    told!    told!    
 yaw rates                 read!    read!    read!    read!    read!    read!    read!    read!
 wheel speeds              read!    read!    -        -        -        -        -        -
 turns on the spot         cut!     cut!     cut!     cut!     cut!     cut!     cut!     cut!
-one bad log of four       told!    told!    told!    told!    told!    told!    told!    told!
-three bad logs of four    refused! refused! refused! refused! refused! refused! refused! refused!
-one bad drive of four     told!    told!    -        -        -        -        -        -
+one bad log of four       told     told     told     told     told     told     told     told
+three bad logs of four    refused  refused  refused  refused  refused  refused  refused  refused
+one bad drive of four     told     told     -        -        -        -        -        -
 GridMap that jumps        -        -        refused  refused  refused  refused  refused  refused
 UTM                       read     read     read     read     read     read     read     read
 """

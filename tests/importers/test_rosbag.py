@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from importers.bags import Bag
 from importers.logged import SETTINGS, VEHICLE, commands, logged
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.importers import rosbag
@@ -95,6 +96,19 @@ def test_bags_that_do_not_say_what_they_hold(seen, tmp_path):
         connection.execute("DELETE FROM message_definitions")
     (log,) = rosbag.read(tmp_path / "a", ACKERMANN)
     np.testing.assert_allclose(log.command, commands(COMMAND_TIME), atol=1e-6)
+
+
+@pytest.mark.parametrize("store", StoragePlugin)
+def test_messages_that_are_compressed_each(seen, tmp_path, store):
+    """Only the file beside the bag says that they are."""
+    with Bag(tmp_path / "a", store, CompressionMode.MESSAGE) as writer:
+        writer.odometry(seen)
+        writer.ackermann(COMMAND_TIME, commands(COMMAND_TIME))
+    (bag,) = (path for path in (tmp_path / "a").iterdir() if path.suffix != ".yaml")
+    for path in (tmp_path / "a", bag):
+        (log,) = rosbag.read(path, ACKERMANN)
+        np.testing.assert_allclose(log.position, seen.state[:, :3])
+        np.testing.assert_allclose(log.command, commands(COMMAND_TIME), atol=1e-6)
 
 
 def test_bags_that_cannot_be_used_are_named(bag, seen, tmp_path):

@@ -98,6 +98,25 @@ def test_drives_come_in_the_order_in_which_they_begin(seen, tmp_path):
     assert [log.time[0] for log in logs] == [99.5, pytest.approx(seen.time[0])]
 
 
+def test_drives_that_cannot_be_used_are_left_out_and_said(seen, tmp_path):
+    drives = {name: [[*row, name] for row in rows(seen)] for name in ("dawn", "noon", "dusk")}
+    settings, path = replace(CSV, table=replace(TABLE, drive="run")), tmp_path / "a.csv"
+
+    def with_wrong(*names):
+        for name in names:
+            for line in drives[name]:
+                line[1] = "nan"
+        return write(path, [*NAMES, "run"], [line for lines in drives.values() for line in lines])
+
+    dawn, dusk = table.read(with_wrong("noon"), settings)
+    assert [dawn.name, dusk.name] == [f"{path}: drive dawn", f"{path}: drive dusk"]
+    (remark,) = dawn.remarks
+    assert remark.startswith(f"{path}: drive noon: position: expected finite numbers")
+    assert dawn.remarks[remark] == len(seen.time) and not dusk.remarks
+    with pytest.raises(DataError, match="drive dusk: position: expected finite numbers"):
+        table.read(with_wrong("dusk"), settings)
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [

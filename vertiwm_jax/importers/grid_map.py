@@ -51,18 +51,22 @@ class Canvas:
 
 
 def terrain(
-    paths: Sequence[Path], wanted: GridMapSettings, frames: Frames
+    paths: Sequence[Path],
+    wanted: GridMapSettings,
+    frames: Frames,
+    said: dict[str, int] | None = None,
 ) -> tuple[TerrainMap, float]:
     """The map from all messages of the bags, and the share of its cells that no message covers.
 
-    Cells that no message covers take the height of the nearest cell. Raises `DataError` naming bag,
-    topic and expectation, and `MapError` if the heights make no map.
+    said: what is said of messages that are left out, and how many there are. Cells that no message
+    covers take the height of the nearest cell. Raises `DataError` naming bag, topic and
+    expectation, and `MapError` if the heights make no map.
     """
     names = [wanted.elevation] + ([wanted.semantic] if wanted.semantic else [])
-    canvas = None
+    canvas, said = None, {} if said is None else said
     for path in paths:
         name = f"{path}: {wanted.topic}"
-        for _, message in rosbag.messages(path, wanted.topic, (_KIND,)):
+        for _, message in rosbag.messages(path, wanted.topic, (_KIND,), said, False):
             patch, origin = _patch(name, message, names)
             canvas = canvas or Canvas(patch, origin, message.info.resolution)
             if not np.isclose(message.info.resolution, canvas.resolution):
@@ -74,8 +78,9 @@ def terrain(
                 canvas.paint(patch, origin)
             except ValueError as error:
                 raise DataError(f"{name}: {error}") from None
-    assert canvas is not None  # A topic without messages is refused.
     name = f"{paths[0]}: {wanted.topic}"
+    if canvas is None:
+        raise DataError(f"{name}: expected messages of {_KIND}, found none")
     known = np.isfinite(canvas.values[0])
     if not known.any():
         raise DataError(f"{name}: {wanted.elevation}: expected heights, found none that is finite")

@@ -1,7 +1,8 @@
 """Logs of other origin as a collection of drives, and what became of them."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +30,8 @@ READERS: dict[str, Reader] = {
     ".bag": rosbag.read,
     ".db3": rosbag.read,
     ".mcap": rosbag.read,
+    ".db3.zstd": rosbag.read,
+    ".mcap.zstd": rosbag.read,
 }
 """Formats of logs, by how their names end."""
 PER_FILE = SPLITS["test"].stop
@@ -46,6 +49,8 @@ def import_drives(
 ) -> str:
     """Writes logged drives as a collection, which `fit` and `evaluate` read, at 10 Hz.
 
+    Logs that cannot be used are left out, as long as they are no more than half.
+
     Args:
         sources: files or folders of logs, in the order in which they were driven.
         output: the folder to make.
@@ -59,108 +64,162 @@ def import_drives(
         DataError, MapError, ConfigError: a file cannot be used; the message names it.
     """
     settings = configuration.load(ImportSettings, settings_file)
-    readers = [_reader(source) for source in sources]
+    logs = dict(log for source in sources for log in _logs(source))
+    if map is None and (settings.rosbag is None or settings.rosbag.grid_map is None):
+        raise DataError(
+            f"{settings_file}: expected ground: give `--map MAP.npz`, which terrain.files.save "
+            "writes (docs/own-map.md), or name a bag's GridMap topic in rosbag.grid_map"
+        )
+    ground = None if map is None else _ground(map, settings)
+    refused = dict[Path, str]()
     with atomic.new_folder(output) as unfinished:
-        terrain, said = _terrain(sources, settings_file, settings, map)
-        drives, rows, remarks = list[Drive](), list[Row](), list[str]()
-        with Progress(len(sources), "logs") as progress:
-            for source, read in zip(sources, readers, strict=True):
-                logs = read(source, settings)
-                remarks += [remark for log in logs for remark in log.remarks]
-                found, row = _import(source, logs, settings, terrain)
+        read = dict[Path, list[Log]]()
+        with Progress(len(logs), "logs") as progress:
+            for path, reader in logs.items():
+                with _leaving_out(path, refused, len(logs)):
+                    read[path] = reader(path, settings)
+                progress.advance(1, path.name)
+        remarks = [remark for path in read for log in read[path] for remark in log.remarks]
+        terrain = _ground_of_bags(list(read), settings, remarks) if ground is None else ground
+        drives, rows = list[Drive](), dict[Path, Row]()
+        for path in read:
+            with _leaving_out(path, refused, len(logs)):
+                found, rows[path] = _import(path, read[path], settings, terrain, remarks)
                 drives += found
-                rows.append(row)
-                progress.advance(1, source.name)
         if not drives:
-            reasons = "; ".join(str(row["left out"]) for row in rows)
+            reasons = "; ".join(str(row["left out"]) for row in rows.values())
             raise DataError(
                 f"{sources[0]}: expected a drive or more that can be used, found none: {reasons}"
             )
         (unfinished / "maps").mkdir()
         files.save(terrain, unfinished / "maps" / "map.npz")
-        meta = {"sources": [str(source) for source in sources], "map": "map.npz"}
+        meta = {"sources": [str(path) for path in logs], "map": "map.npz"}
         wheels = settings.vehicle.wheels_in_body_xy
         for number, first in enumerate(range(0, len(drives), PER_FILE)):
             some = schema.in_file(_arrays(drives[first : first + PER_FILE]), terrain.offset())
             schema.write(unfinished / f"drives_{number:03d}.npz", some, meta, wheels)
-    remarks += _remarks(drives, terrain, settings.vehicle.scale)
-    return "\n".join([markdown(rows), "", *said, *remarks])
+    remarks += [*refused.values(), *_remarks(drives, terrain, settings.vehicle.scale)]
+    none = dict.fromkeys(next(iter(rows.values())), "-") | {"left out": "all"}
+    table = [rows.get(path, none | {"log": str(path)}) for path in logs]
+    return "\n".join([markdown(table), "", *remarks])
 
 
-def _reader(source: Path) -> Reader:
+def _logs(source: Path) -> list[tuple[Path, Reader]]:
+    """The logs in a file or folder, in the order of their names, each with what reads it."""
     if not source.exists():
         raise DataError(f"{source}: expected a file or folder of logs, found none")
     if (source / "metadata.yaml").is_file():
-        return rosbag.read
-    if source.suffix not in READERS:
-        endings = ", ".join(READERS)
-        raise DataError(f"{source}: expected a name that ends in one of {endings}, or a ROS 2 bag")
-    return READERS[source.suffix]
+        return [(source, rosbag.read)]
+    endings = ", ".join(READERS)
+    if source.is_dir():
+        inside = sorted(source.iterdir())
+        bags = [path for path in inside if (path / "metadata.yaml").is_file()]
+        found = [path for path in inside if path in bags or path.name.endswith(tuple(READERS))]
+        if found:
+            return [log for path in found for log in _logs(path)]
+        raise DataError(f"{source}: expected names that end in one of {endings}, found none")
+    for ending, read in READERS.items():
+        if source.name.endswith(ending):
+            return [(source, read)]
+    raise DataError(f"{source}: expected a name that ends in one of {endings}, or a ROS 2 bag")
 
 
-def _terrain(
-    sources: Sequence[Path], settings_file: Path, settings: ImportSettings, map: Path | None
-) -> tuple[TerrainMap, list[str]]:
-    if map is not None:
-        if map.is_dir():
-            raise DataError(f"{map}: expected the .npz map of one world, found a folder")
-        return files.load_map(map, scale=settings.vehicle.scale), []
-    if settings.rosbag is None or settings.rosbag.grid_map is None:
-        raise DataError(
-            f"{settings_file}: expected ground: give `--map MAP.npz`, which terrain.files.save "
-            "writes (docs/own-map.md), or name a bag's GridMap topic in rosbag.grid_map"
-        )
-    terrain, unknown = grid_map.terrain(sources, settings.rosbag.grid_map, settings.frames)
-    terrain = froude.scaled(terrain, settings.vehicle.scale)
-    return terrain, [f"{unknown:.0%} of the map had no height, and took that of the nearest cell"]
+@contextmanager
+def _leaving_out(path: Path, refused: dict[Path, str], logs: int) -> Iterator[None]:
+    """Takes down why a log is refused in the context; raises it where these are more than half."""
+    try:
+        yield
+    except DataError as error:
+        refused[path] = str(error)
+        if 2 * len(refused) > logs:
+            first = next(iter(refused.values()))
+            among = f"; {len(refused)} of {logs} logs are refused, the first by this"
+            raise DataError(first + among * (logs > 1)) from error
+
+
+def _ground(map: Path, settings: ImportSettings) -> TerrainMap:
+    if map.is_dir():
+        raise DataError(f"{map}: expected the .npz map of one world, found a folder")
+    return files.load_map(map, scale=settings.vehicle.scale)
+
+
+def _ground_of_bags(
+    paths: Sequence[Path], settings: ImportSettings, remarks: list[str]
+) -> TerrainMap:
+    assert settings.rosbag is not None and settings.rosbag.grid_map is not None
+    said = dict[str, int]()
+    terrain, unknown = grid_map.terrain(paths, settings.rosbag.grid_map, settings.frames, said)
+    remarks += [
+        *said,
+        f"{unknown:.0%} of the map had no height, and took that of the nearest cell",
+    ]
+    return froude.scaled(terrain, settings.vehicle.scale)
 
 
 def _import(
-    source: Path, logs: Sequence[Log], settings: ImportSettings, terrain: TerrainMap
+    path: Path,
+    logs: Sequence[Log],
+    settings: ImportSettings,
+    terrain: TerrainMap,
+    remarks: list[str],
 ) -> tuple[list[Drive], Row]:
-    """The drives of a source that are on the map, and its row of the table.
+    """The drives of a file that are on the map, and its row of the table.
 
-    Raises `DataError` unless all drives are of the schema, and move where they say.
+    Raises `DataError` unless most of its logs are of the schema, and move where they say.
     """
     scale = settings.vehicle.scale
-    drives, left_out = list[Drive](), Counter[str]()
+    drives, left_out, refused = list[Drive](), Counter[str](), list[str]()
     point = scale * np.asarray(settings.vehicle.logged_point)
     offset = np.append(terrain.offset(), 0)
+    low, high = map(np.asarray, terrain.extent)
     for log in logs:
         log = replace(log, position=log.position - offset)
-        found, short = resampling.resample(log, settings.resampling, point)
-        drives += found
-        left_out += short
+        found, others = resampling.resample(log, settings.resampling, point)
+        try:
+            if found:
+                schema.check(log.name, _arrays(found))
+        except DataError as error:
+            refused.append(str(error))
+            continue
+        for drive in found:
+            xy = drive.state[:, :2]
+            if ((xy >= low) & (xy <= high)).all():
+                drives.append(drive)
+            else:
+                others["off the map"].append(drive.start)
+        for why, moments in others.items():
+            if why not in left_out:
+                first = min(moments) / (scale**0.5 * settings.units.time)
+                remarks.append(f"{log.name}: from {first:.10g} on: {why}")
+            left_out[why] += len(moments)
+    if 2 * len(refused) > len(logs):
+        raise DataError(refused[0])
+    remarks += refused
     if drives:
-        schema.check(source, _arrays(drives))
         way_off, axis_off = resampling.directions(drives)
         if way_off > LARGEST_ANGLE:
             raise DataError(
-                f"{source}: velocity: expected to point where the positions go, found "
+                f"{path}: velocity: expected to point where the positions go, found "
                 f"{np.degrees(way_off):.0f} degrees off in half of the steps; see `frames` of the "
                 "settings, and the order of quaternions"
             )
         if logs[0].velocity is None and axis_off > LARGEST_ANGLE:
             raise DataError(
-                f"{source}: attitude: expected a vehicle that moves along its x axis, found "
+                f"{path}: attitude: expected a vehicle that moves along its x axis, found "
                 f"{np.degrees(axis_off):.0f} degrees off in half of the steps; see `units.angle` "
                 "and `frames` of the settings, and the order of quaternions"
             )
-    low, high = map(np.asarray, terrain.extent)
-    paths = (drive.state[:, :2] for drive in drives)
-    inside = [((xy >= low) & (xy <= high)).all() for xy in paths]
-    kept = [drive for drive, stays in zip(drives, inside, strict=True) if stays]
+    left_out["logged drives"] += len(refused)
     left_out["samples"] += sum(count for log in logs for count in log.remarks.values())
-    left_out["off the map"] += len(drives) - len(kept)
     reasons = ", ".join(f"{count} {why}" for why, count in left_out.items() if count)
     apart = np.concatenate([np.diff(log.time) for log in logs])
     derived = {"velocity": logs[0].velocity, "angular velocity": logs[0].angular_velocity}
-    return kept, {
-        "log": str(source),
+    return drives, {
+        "log": str(path),
         "poses a second": f"{scale**0.5 / np.median(apart):.1f}" if len(apart) else "-",
         "from poses": ", ".join(name for name, logged in derived.items() if logged is None) or "-",
-        "drives": len(kept),
-        "steps": f"{sum(len(drive.control) for drive in kept):,}",
+        "drives": len(drives),
+        "steps": f"{sum(len(drive.control) for drive in drives):,}",
         "left out": reasons or "-",
     }
 

@@ -24,8 +24,9 @@ class Log:
     time: `[N]` s, increasing; position: `[N, 3]` p_world, m; attitude: of body to world, `[N, 3]`
     roll, pitch, yaw, rad, or `[N, 4]` quaternions x, y, z, w; command_time: `[M]` s, increasing;
     command: `[M, 2]` speed and front-wheel angle, m/s and rad; velocity: `[N, 3]` v_body, m/s, and
-    angular_velocity: `[N, 3]` omega_body, rad/s, None where they were not logged; remarks: what
-    was found and left out of the file, and how many samples.
+    angular_velocity: `[N, 3]` omega_body, rad/s, None where they were not logged; name: of the
+    file, and of the drive in it; remarks: what was found and left out of the file, and how many
+    samples.
     """
 
     time: np.ndarray
@@ -35,6 +36,7 @@ class Log:
     command: np.ndarray
     velocity: np.ndarray | None = None
     angular_velocity: np.ndarray | None = None
+    name: str = ""
     remarks: dict[str, int] = field(default_factory=dict)
 
     @cached_property
@@ -82,6 +84,7 @@ def converted(
             f"found {len(poses) - 1} and {len(commands) - 1} times"
         )
     logs = [_in_si(log.part(*both), settings) for both in zip(poses, commands, strict=True)]
+    logs = [replace(log, name=str(name)) for log in logs]
     return [replace(logs[0], remarks=said), *logs[1:]]
 
 

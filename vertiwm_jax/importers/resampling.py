@@ -1,6 +1,6 @@
 """Resamples logs with irregular time stamps to drives at 10 Hz."""
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,30 +14,44 @@ from vertiwm_jax.state import STEP_SECONDS
 
 _TOLERANCE = 1e-6
 """s; stamps since 1970 are no finer in double precision than 2.4e-7 s."""
+_FASTEST, _NEAR = 50.0, 1.0
+"""m/s and m; positions that are farther apart than either allows leap."""
 _EACH_SIDE = 3
 """Poses before and after a moment that a parabola is fitted to, however few its window holds."""
 
 
+LeftOut = defaultdict[str, list[float]]
+"""When something was left out or cut, s, by the reason."""
+
+
 @dataclass(frozen=True)
 class Drive:
-    """T steps: state `[T + 1, 12]` and control `[T, 2]`, as in the schema of recorded drives."""
+    """T steps: state `[T + 1, 12]` and control `[T, 2]`, as in the schema of recorded drives.
 
+    start: s, the log's time of the first state.
+    """
+
+    start: float
     state: np.ndarray
     control: np.ndarray
 
 
 def resample(
     log: Log, settings: Resampling, logged_point: np.ndarray
-) -> tuple[list[Drive], Counter[str]]:
-    """The drives between the gaps of a log, and the number of those left out, by the reason.
+) -> tuple[list[Drive], LeftOut]:
+    """The drives between the gaps and leaps of a log, and what is left out or cut.
 
     logged_point: `[3]` m in the body frame, the point whose position was logged. Positions and
     logged velocities are interpolated linearly, attitudes along the shortest rotation; a command
     holds until the next. Velocities that were not logged are slopes of parabolas that are fitted to
     the poses within `settings.window`.
     """
-    drives, left_out = list[Drive](), Counter[str]()
-    for poses in _runs(log.time, settings.gap):
+    drives, left_out = list[Drive](), LeftOut(list)
+    moved = np.linalg.norm(np.diff(log.position, axis=0), axis=1)
+    leaps = moved > _NEAR + _FASTEST * np.diff(log.time)
+    if leaps.any():
+        left_out["cut at a leap of the position"] += log.time[1:][leaps].tolist()
+    for poses in _runs(log.time, settings.gap, leaps):
         part = log.part(poses)
         last = part.time[-1]
         for commands in _runs(log.command_time, settings.command_gap):
@@ -47,12 +61,12 @@ def resample(
                 continue
             steps = int((end - start + _TOLERANCE) / STEP_SECONDS)
             if steps < settings.shortest:
-                left_out[f"shorter than {settings.shortest} steps"] += 1
+                left_out[f"shorter than {settings.shortest} steps"].append(start)
                 continue
             at = np.minimum(start + STEP_SECONDS * np.arange(steps + 1), last)
             state = _state(part, at, settings.window, logged_point)
             latest = np.searchsorted(log.command_time, at[:-1] + _TOLERANCE, side="right") - 1
-            drives += _pieces(Drive(state, log.command[latest]), settings.longest)
+            drives += _pieces(Drive(start, state, log.command[latest]), settings.longest)
     return drives, left_out
 
 
@@ -75,9 +89,9 @@ def directions(drives: Sequence[Drive]) -> tuple[float, float]:
     return float(way_off), float(axis_off)
 
 
-def _runs(stamps: np.ndarray, gap: float) -> Iterator[slice]:
-    """Where `[N]` stamps follow each other within `gap`."""
-    cuts = np.flatnonzero(np.diff(stamps) > gap) + 1
+def _runs(stamps: np.ndarray, gap: float, cut: np.ndarray | bool = False) -> Iterator[slice]:
+    """Where `[N]` stamps follow each other within `gap`, without a cut: `[N - 1]`."""
+    cuts = np.flatnonzero((np.diff(stamps) > gap) | cut) + 1
     for first, end in pairwise([0, *cuts, len(stamps)]):
         yield slice(first, end)
 
@@ -130,4 +144,5 @@ def _pieces(drive: Drive, longest: int) -> Iterator[Drive]:
     steps = len(drive.control)
     cuts = np.linspace(0, steps, -(-steps // longest) + 1).astype(int)
     for first, end in pairwise(cuts):
-        yield Drive(drive.state[first : end + 1], drive.control[first:end])
+        start = drive.start + STEP_SECONDS * first
+        yield Drive(start, drive.state[first : end + 1], drive.control[first:end])

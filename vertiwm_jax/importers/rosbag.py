@@ -1,8 +1,11 @@
 """Reads odometry and commands from ROS 1 and ROS 2 bags."""
 
+import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,6 +20,8 @@ _ACKERMANN = ("ackermann_msgs/msg/AckermannDriveStamped", "ackermann_msgs/msg/Ac
 _TWIST = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
 _SLOWEST = 0.05  # m/s at full size
 _FARTHEST = np.radians(45)
+_ZSTD = bytes.fromhex("28b52ffd")
+_MEND = "`rosbag reindex`, `ros2 bag reindex` or `mcap recover` mend what was cut off"
 
 # Bags of ROS 2 up to Humble do not say what their messages hold; these are not in its base.
 DEFINITIONS = {
@@ -46,21 +51,21 @@ DEFINITIONS = {
 
 
 def read(path: Path, settings: ImportSettings) -> list[Log]:
-    """Reads the log of a bag: a `.bag` file of ROS 1, or a folder of ROS 2.
+    """Reads the log of a bag: a `.bag` file of ROS 1, a folder of ROS 2, or a file of one.
 
     Raises `DataError` naming bag, topic and expectation.
     """
     names = settings.rosbag
     if names is None:
         raise DataError(f"{path}: expected settings with a section `rosbag` that names its topics")
-    by_header = names.stamps == "header"
+    by_header, said = names.stamps == "header", dict[str, int]()
     poses = [
         (_stamp(received, message, by_header), *_odometry(message))
-        for received, message in messages(path, names.odometry, _ODOMETRY)
+        for received, message in messages(path, names.odometry, _ODOMETRY, said)
     ]
     commands = [
         (_stamp(received, message, by_header), *_command(message))
-        for received, message in messages(path, names.command, (*_ACKERMANN, *_TWIST))
+        for received, message in messages(path, names.command, (*_ACKERMANN, *_TWIST), said)
     ]
     time, position, attitude, velocity, omega = (np.array(x) for x in zip(*poses, strict=True))
     command_time, speed, turn, is_twist = (np.array(x) for x in zip(*commands, strict=True))
@@ -73,7 +78,7 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
         command_time=command_time,
         command=np.stack([speed, turn], axis=1),
     )
-    logs = converted(found, path, settings)
+    logs = converted(found, path, settings, said.items())
     if not (is_twist[0] and names.twist == "yaw_rate"):
         return logs
     # At full size the wheelbase is `scale` times as long; the yaw rate is still the vehicle's.
@@ -98,35 +103,86 @@ def steering(speed: np.ndarray, yaw_rate: np.ndarray, wheelbase: float) -> np.nd
     return np.where(latest >= 0, angle[latest], 0)
 
 
-def messages(path: Path, topic: str, kinds: Sequence[str]) -> Iterator[tuple[int, Any]]:
+def messages(
+    path: Path,
+    topic: str,
+    kinds: Sequence[str],
+    said: dict[str, int],
+    needed: bool = True,
+) -> Iterator[tuple[int, Any]]:
     """The messages of a topic, each with the time at which it was received, ns.
 
-    Raises `DataError` where the bag cannot be read, or has no such messages.
+    Messages that cannot be read are left out; said: what is said of them, and how many there are.
+
+    Raises `DataError` where the bag or most of its messages cannot be read, or none is `needed`.
     """
     with needs("rosbags", "logs", path):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    if path.suffix in (".db3", ".mcap"):  # Of a folder that says what is in it.
-        path = path.parent
     store = get_typestore(Stores.ROS2_HUMBLE)
     for kind, text in DEFINITIONS.items():
         store.register(get_types_from_msg(text, kind))
     with (
-        refusing(lambda found: DataError(f"{path}: expected a ROS bag: {found}")),
-        AnyReader([path], default_typestore=store) as reader,
+        refusing(lambda found: DataError(f"{path}: expected a ROS bag: {found}; {_MEND}")),
+        _unpacked(path) as file,
+        AnyReader([file], default_typestore=store) as reader,
     ):
         found = [c for c in reader.connections if c.topic == topic]
         others = sorted({c.msgtype for c in found} - set(kinds))
         expected = f"{path}: {topic}: expected messages of {' or '.join(kinds)}"
         if others:
             raise DataError(f"{expected}, found {', '.join(others)}")
-        read = 0
-        for connection, received, data in reader.messages(found) if found else ():
-            yield received, reader.deserialize(data, connection.msgtype)
+        read, wrong = 0, list[str]()
+        each = reader.messages(found) if found else iter(())
+        while True:
+            try:
+                connection, received, data = next(each)
+            except StopIteration:
+                break
+            except Exception as error:
+                # Where a part of the file cannot be read, nobody knows where the next begins.
+                lost = max(sum(c.msgcount for c in found) - read, 1)
+                wrong += [f"a bag that cannot be read after {read} messages: {error}"] * lost
+                break
+            try:
+                message = reader.deserialize(_plain(data), connection.msgtype)
+            except Exception as error:
+                wrong.append(f"one received at {1e-9 * received:.10g} that cannot be read: {error}")
+                continue
+            yield received, message
             read += 1
-        if not read:
+        if wrong:
+            told = " ".join(f"{expected}, found {wrong[0]}; {len(wrong)} such".split())
+            if len(wrong) > read:
+                raise DataError(told)
+            said[f"{told}: left out"] = len(wrong)
+        if needed and not read:
             every = ", ".join(sorted({c.topic for c in reader.connections}))
             raise DataError(f"{expected}, found none; there is {every or 'nothing'}")
+
+
+@contextmanager
+def _unpacked(path: Path) -> Iterator[Path]:
+    """The bag without the compression of its file, for as long as the context lasts."""
+    if path.suffix != ".zstd":
+        yield path
+        return
+    with needs("pyarrow", "logs", path):
+        import pyarrow
+    with TemporaryDirectory() as folder:
+        whole = Path(folder) / path.stem
+        with pyarrow.input_stream(path, compression="zstd") as packed, whole.open("wb") as file:
+            shutil.copyfileobj(packed, file)
+        yield whole
+
+
+def _plain(data: bytes) -> bytes:
+    """A message without the compression that is told only beside the file."""
+    if bytes(data[:4]) != _ZSTD:
+        return data
+    import pyarrow  # It comes with rosbags in the extra.
+
+    return pyarrow.input_stream(pyarrow.py_buffer(data), compression="zstd").read()
 
 
 def _stamp(received: int, message: Any, by_header: bool) -> float:

@@ -2,6 +2,7 @@
 
 import csv
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ Columns = dict[str, np.ndarray]
 def read(path: Path, settings: ImportSettings) -> list[Log]:
     """The drives of a CSV or Parquet file, in the order in which they begin.
 
-    Raises `DataError` naming file, column and expectation.
+    Drives that cannot be used are left out. Raises `DataError` naming file, column and expectation
+    where they are more than half.
     """
     table = settings.table
     if table is None:
@@ -30,11 +32,18 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
     drives = columns.pop(table.drive).astype(str)
     labels, first = np.unique(drives, return_index=True)
     logs = []
+    refused = 0
     for label in labels[np.argsort(first)]:
         own = {name: column[drives == label] for name, column in columns.items()}
         name = f"{path}: drive {label}"
-        logs += converted(_log(name, own, table), name, settings, () if logs else remarks.items())
-    return logs
+        try:
+            logs += converted(_log(name, own, table), name, settings)
+        except DataError as error:
+            refused += 1
+            if 2 * refused > len(labels):
+                raise
+            remarks[str(error)] = int((drives == label).sum())
+    return [replace(logs[0], remarks=remarks | logs[0].remarks), *logs[1:]]
 
 
 def _csv_columns(path: Path, names: Sequence[str]) -> tuple[Columns, dict[str, int]]:

@@ -170,7 +170,7 @@ def find_map(path: Path, name: str) -> Path:
 
 
 def check(
-    path: Path, arrays: dict[str, np.ndarray], offset: np.ndarray = np.zeros(2)
+    path: str | Path, arrays: dict[str, np.ndarray], offset: np.ndarray = np.zeros(2)
 ) -> dict[str, np.ndarray]:
     """Arrays of the schema, numbers in float32; raises `DataError`, which names `path`.
 
