@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pyarrow
 import pytest
-import tifffile
 from faults.border import refusal
 from importers.bags import Bag
 from importers.logged import SETTINGS, logged
+from PIL import Image
 from pyarrow import parquet
 
 from vertiwm_jax.importers import rosbag, table
@@ -150,12 +150,10 @@ def test_what_a_map_holds_may_be_of_another_type(good, case):
 
 def tagged_without_width():
     stream = io.BytesIO()
-    tifffile.imwrite(stream, np.ones((21, 21), np.float32))
-    data = bytearray(stream.getvalue())
-    with tifffile.TiffFile(io.BytesIO(data)) as file:
-        place = file.pages.first.tags["ImageWidth"].valueoffset
-    struct.pack_into("<H", data, place, 0)
-    return bytes(data)
+    Image.fromarray(np.ones((21, 21), np.float32)).save(stream, "TIFF")
+    width, none = (struct.pack("<HHLL", 256, 4, 1, size) for size in (21, 0))
+    assert stream.getvalue().count(width) == 1
+    return stream.getvalue().replace(width, none)
 
 
 HEIGHTS = {

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,10 +13,11 @@ import numpy as np
 from PIL import Image
 
 from vertiwm_jax import atomic, froude
-from vertiwm_jax.errors import needs, refusing
+from vertiwm_jax.errors import refusing
 from vertiwm_jax.precision import float32
-from vertiwm_jax.terrain import query, soil, vertibench
+from vertiwm_jax.terrain import geotiff, query, soil, vertibench
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
+from vertiwm_jax.terrain.geotiff import Raster
 from vertiwm_jax.terrain.map import MapError, TerrainMap, stack
 from vertiwm_jax.terrain.soil import Soil
 
@@ -29,7 +31,6 @@ _SOIL_FIELDS = {
     "Janosi_shear": ("shear_modulus", 1.0),
     "unit_weight": ("unit_weight", 1.0),
 }
-_NO_DATA = 42113  # GDAL's tag of the value that stands for none
 
 
 @float32
@@ -103,30 +104,35 @@ def soil_of_chrono(soils: Soil, kind: int) -> list[float]:
 
 def from_heightmap(
     path: str | Path,
-    resolution: float,
+    resolution: float | None = None,
     height_range: tuple[float, float] | None = None,
     class_image: str | Path | None = None,
     default_class: str = "grass",
     ground: GroundClasses = STANDARD,
     origin: tuple[float, float] | None = None,
+    height_offset: float = 0.0,
 ) -> TerrainMap:
     """Makes a map from heights in a 16-bit PNG, `.npy` or GeoTIFF file; row 0 is north.
 
     Args:
         path: the file.
-        resolution: m between pixels.
+        resolution: m between pixels; may be left out for a GeoTIFF that tells it.
         height_range: heights in m of the darkest and the brightest integer that a pixel can hold;
             without it, values are meters.
         class_image: an 8-bit image of ids, or an RGB image of the palette's colors, over the same
-            extent at any resolution.
+            extent at any resolution; also a `.npy` or GeoTIFF file.
         default_class: all ground, where there is no such image.
         ground: the classes of ground that ids and colors refer to.
-        origin: x, y of the first pixel, m; the map is centered by default.
+        origin: x, y of the first pixel, m; by default that of a GeoTIFF, while other maps are
+            centered.
+        height_offset: m that are added to all heights.
 
     Raises:
-        MapError: a file is missing or malformed; the message names it and the field.
+        MapError: a file is missing or malformed, or a GeoTIFF says something else; the message
+            names the file and the field.
     """
-    name, heights = str(path), _read_raster(Path(path), "elevation")
+    name, raster = str(path), _read_raster(Path(path), "elevation", geotiff.heights)
+    heights, resolution = raster.pixels, _agreed(name, resolution, raster.size)
     if height_range is not None:
         if not np.issubdtype(heights.dtype, np.unsignedinteger):
             raise MapError(
@@ -135,11 +141,31 @@ def from_heightmap(
             )  # fmt: skip
         low, high = height_range
         heights = low + heights * ((high - low) / np.iinfo(heights.dtype).max)
-    classes = default_class if class_image is None else _read_classes(Path(class_image), ground)
-    name = name if class_image is None else f"{name} with {class_image}"
+    classes = default_class
+    if class_image is not None:
+        classes = _read_classes(Path(class_image), ground, raster)
+        name = f"{name} with {class_image}"
     return TerrainMap.from_array(
-        heights, classes, resolution=resolution, origin=origin, ground=ground, name=name
+        heights + height_offset if height_offset else heights,
+        classes,
+        resolution=resolution,
+        origin=raster.origin if origin is None else origin,
+        ground=ground,
+        name=name,
     )
+
+
+def _agreed(name: str, asked: float | None, told: float | None) -> float:
+    """Meters between pixels, by the caller and by the file; raises `MapError` unless they agree."""
+    if told is None:
+        if asked is None:
+            expected = "meters between pixels, which the file does not tell"
+            raise MapError(name, "resolution", expected, "none")
+        return asked
+    if asked is not None and not math.isclose(asked, told, rel_tol=1e-3):
+        expected, mend = f"{told:.6g} m between pixels, as the file tells", "leave resolution out"
+        raise MapError(name, "resolution", expected, f"{asked:g}", mend)
+    return told
 
 
 def _load_world(path: Path) -> TerrainMap:
@@ -189,33 +215,31 @@ def _soil(key: str, values: dict[str, float], name: str) -> Soil:
     return Soil(**known)
 
 
-def _read_raster(path: Path, field: str) -> np.ndarray:
+def _read_raster(path: Path, field: str, from_geotiff: Callable[[Path, str], Raster]) -> Raster:
     """The pixels of an image, GeoTIFF or `.npy` file."""
     with refusing(partial(MapError, str(path), field, "a PNG, .npy or GeoTIFF file")):
         suffix = path.suffix.lower()
         if suffix == ".npy":
-            return np.load(path, allow_pickle=False)
+            return Raster(np.load(path, allow_pickle=False))
         if suffix in (".tif", ".tiff"):
-            return _read_geotiff(path, field)
+            return from_geotiff(path, field)
         with Image.open(path) as image:
-            return np.asarray(image.convert("RGB") if image.mode in ("P", "RGBA") else image)
+            return Raster(
+                np.asarray(image.convert("RGB") if image.mode in ("P", "RGBA") else image)
+            )
 
 
-def _read_geotiff(path: Path, field: str) -> np.ndarray:
-    with needs("tifffile", "geotiff", f"{path}: {field}"):
-        import tifffile
-    with tifffile.TiffFile(path) as tiff:
-        page = tiff.pages.first
-        pixels = page.asarray()
-        if page.tags.get(_NO_DATA) and (holes := np.sum(pixels == page.nodata)):
-            found = f"{holes} that are {page.nodata:g}, no data"
-            raise MapError(str(path), field, "a value in every pixel", found, "fill the holes")
-    return pixels
-
-
-def _read_classes(path: Path, classes: GroundClasses) -> np.ndarray:
+def _read_classes(path: Path, classes: GroundClasses, heights: Raster) -> np.ndarray:
     """`[r, c]` class ids from an image of ids or of palette colors."""
-    pixels = _read_raster(path, "class_image")
+    raster = _read_raster(path, "class_image", geotiff.classes)
+    pixels = raster.pixels
+    found, wanted = raster.edges, heights.edges
+    if (np.abs(found - wanted) > (raster.size or 0) + (heights.size or 0)).any():
+        expected, found = (", ".join(f"{x:.10g}" for x in edges) for edges in (wanted, found))
+        raise MapError(
+            str(path), "class_image", f"the edges of the heights (x, y: {expected})", found,
+            f"cut it, for example by `gdalwarp -te {expected.replace(',', '')} a.tif b.tif`",
+        )  # fmt: skip
     if pixels.ndim == 2:
         return pixels
     if pixels.ndim != 3 or pixels.shape[2] != 3:

@@ -1,5 +1,6 @@
 """The terrain map of one world, or of many stacked worlds."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -31,6 +32,8 @@ class MapError(UserError, ValueError):
 
 BY_WORLD = ("elevation", "semantic", "friction", "obstacles")
 """The arrays of a map of which each world has its own."""
+MOST = 10**8
+"""Numbers that an array of a map holds at most; checked before one is read."""
 FAR = 1e3
 """Distance, m, of the middle of a map from x = y = 0 beyond which positions are counted from it:
 within it, float32 resolves a tenth of a millimeter."""
@@ -307,6 +310,13 @@ def _soils_by_world(terrain: TerrainMap) -> Soil:
     """Leaves `[W, K]`, also where all worlds share them."""
     shape = (terrain.worlds, len(terrain.class_names))
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape), terrain.soils)
+
+
+def bounded(name: str, field: str, shape: Sequence[int]) -> None:
+    """Raises `MapError` where an array of this shape would be too large to be read."""
+    if math.prod(shape) > MOST:
+        found = " x ".join(map(str, shape))
+        raise MapError(name, field, f"at most {MOST:,} numbers", found, "cut the map to a part")
 
 
 def _check(
