@@ -108,6 +108,8 @@ def _rounded(name: str, array: np.ndarray, length: np.ndarray) -> np.ndarray:
     """An array of the schema `[K, ...]` as a compact file has it, of drives of `length` `[K]`."""
     if name == "length":
         return array.astype(np.int32)
+    if name == "split":
+        return array
     last = length if name != "control" else np.maximum(length - 1, 0)
     index = np.minimum(np.arange(array.shape[1]), last[:, None])
     array = array[np.arange(len(array))[:, None], index]

@@ -12,10 +12,9 @@ from doors import door, refusal
 from faults.border import fault
 from learning import recordings
 
-from vertiwm_jax.evaluation import calibration, prediction, report
+from vertiwm_jax.evaluation import calibration, prediction, prediction_report, report
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning import experiment as fitting
-from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain.map import TerrainMap
@@ -40,7 +39,6 @@ def maps(folder, size, count=1):
     return folder
 
 
-@fault(DataError, "the split is by number, so that few drives are all trained on")
 def test_few_drives_are_split_by_share(tmp_path):
     recordings.write(tmp_path, **recordings.drives(count=10))
     found = [dataset.load_drives(tmp_path, split)[0].state for split in dataset.SPLITS]
@@ -50,11 +48,60 @@ def test_few_drives_are_split_by_share(tmp_path):
     assert len(found[0]) >= 6
 
 
-@fault(Begun, "that nothing can be tested on is told when the first model has been fitted")
 def test_too_few_drives_are_refused_before_a_run_begins(tmp_path, monkeypatch):
     recordings.write(tmp_path, **recordings.drives(count=1))
     monkeypatch.setattr(fitting.Run, "begin", begin)
-    assert str(tmp_path) in refusal(door("fit"), "--data", tmp_path, "--runs", tmp_path / "runs")
+    message = refusal(door("fit"), "--data", tmp_path, "--runs", tmp_path / "runs")
+    told = f"error: {tmp_path}: 1 drives: 1 train, 0 validation, 0 test (too few to share out): "
+    assert message.startswith(told) and "resampling.longest" in message
+
+
+def test_drives_that_are_too_short_are_refused_before_a_run_begins(tmp_path, monkeypatch):
+    recordings.write(tmp_path, **recordings.drives(count=10, steps=31))
+    monkeypatch.setattr(fitting.Run, "begin", begin)
+    message = refusal(door("fit"), "--data", tmp_path, "--runs", tmp_path / "runs")
+    assert message.startswith(f"error: {tmp_path}: 10 drives: ")
+    assert "at least 32 steps in the train split, found at most 31" in message
+
+
+@pytest.mark.parametrize(
+    ("count", "told"),
+    [
+        (1, "1 drives: 1 train, 0 validation, 0 test (too few to share out); predicted: all"),
+        (10, "10 drives: 8 train, 1 validation, 1 test (by share of drives); predicted: test"),
+    ],
+)
+def test_a_small_import_is_predicted(tmp_path, capsys, count, told):
+    recordings.write(tmp_path, **recordings.drives(count=count))
+    door("evaluate")(["prediction", "--data", str(tmp_path), "--models", "builtin"])
+    out = capsys.readouterr().out
+    assert f"{tmp_path}: {told}\n" in out
+    assert "rigid (n = 1)" in out
+
+
+def test_all_drives_are_predicted_where_that_is_asked_for(tmp_path, capsys):
+    recordings.write(tmp_path, **recordings.drives(count=10))
+    asked = ["prediction", "--data", str(tmp_path), "--models", "builtin", "--split", "all"]
+    door("evaluate")(asked)
+    assert "rigid (n = 10)" in capsys.readouterr().out
+
+
+def test_shares_are_set_and_told(tmp_path, capsys):
+    recordings.write(tmp_path, **recordings.drives(count=10))
+    shares = ["--splits.shares", "0.5", "0.2", "0.3"]
+    door("evaluate")(["prediction", "--data", str(tmp_path), "--models", "builtin", *shares])
+    out = capsys.readouterr().out
+    assert "10 drives: 5 train, 2 validation, 3 test" in out and "rigid (n = 3)" in out
+
+
+@pytest.mark.parametrize("test", ["calibration", "prediction"])
+def test_a_split_without_drives_is_refused_before_models_are_read(tmp_path, monkeypatch, test):
+    recordings.write(tmp_path, **recordings.drives(count=10), split=np.repeat("train", 10))
+    for place in (calibration, prediction_report):
+        monkeypatch.setattr(place, "load_model", begin)
+    message = refusal(door("evaluate"), test, "--data", tmp_path)
+    assert message.startswith(f"error: {tmp_path}: 10 drives: 10 train, 0 validation, 0 test")
+    assert "(as files say)" in message
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "td3"])

@@ -115,9 +115,9 @@ def test_a_log_is_imported_where_its_map_is(tmp_path):
         words = [tmp_path / f"{name}.csv", "--settings", tmp_path / "settings.yaml"]
         words += ["--map", tmp_path / f"{name}.npz", "--output", tmp_path / name]
         door("import_drives")([str(word) for word in words])
-        with np.load(tmp_path / name / "drives_000.npz") as file:
+        with np.load(tmp_path / name / "drives.npz") as file:
             states[name] = np.asarray(file["state"], float) - [x, y, *np.zeros(10)]
-        (drives, terrain) = dataset.load_file(tmp_path / name / "drives_000.npz")
+        (drives, terrain) = dataset.load_file(tmp_path / name / "drives.npz")
         at = drives.state[..., :2] + terrain.offset() - [x, y]
         np.testing.assert_allclose(at, states[name][..., :2], atol=1e-5)
     np.testing.assert_allclose(states["far"], states["near"], atol=1e-5)

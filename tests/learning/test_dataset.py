@@ -1,10 +1,15 @@
 import json
+import shutil
+from itertools import chain
+from pathlib import Path
 
 import numpy as np
 import pytest
 from learning.recordings import GRASS, SNOW, STEPS, drives, wheel_signals, write
 
+from vertiwm_jax.config import ConfigError
 from vertiwm_jax.learning import dataset
+from vertiwm_jax.learning.dataset import Collection, SplitConfig
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
@@ -25,9 +30,141 @@ def test_a_split_is_its_drives_of_every_file(tmp_path, split, first, count):
     np.testing.assert_array_equal(loaded.state, np.concatenate([expected, expected]))
 
 
-def test_splits_share_no_drive():
-    every = [i for split in dataset.SPLITS.values() for i in split]
-    assert sorted(every) == list(range(25))
+def purposes(folder, splits=SplitConfig()):
+    """What each drive is for, `[K]` of every file, by its name without ending."""
+    collection = Collection.of(folder, splits)
+    return {path.stem: found.tolist() for path, found in collection.purposes.items()}
+
+
+def runs(*counts):
+    """Purposes in a row: so many to train, for validation, to test, to train, ..."""
+    return np.repeat(np.resize(dataset.SPLITS, len(counts)), counts).tolist()
+
+
+@pytest.mark.parametrize(
+    ("count", "expected"),
+    [
+        (1, (1,)),
+        (2, (2,)),
+        (3, (1, 1, 1)),
+        (5, (3, 1, 1)),
+        (10, (8, 1, 1)),
+        (25, (20, 2, 3)),
+        (50, (20, 2, 3, 20, 2, 3)),
+        (500, (20, 2, 3) * 20),
+    ],
+)
+def test_drives_are_shared_out(tmp_path, count, expected):
+    write(tmp_path, **drives(count=count))
+    assert purposes(tmp_path) == {"a": runs(*expected)}
+
+
+@pytest.mark.parametrize("count", [3, 4, 7, 24, 26, 99, 501])
+@pytest.mark.parametrize("shares", [(0.8, 0.08, 0.12), (0.5, 0.25, 0.25), (0.1, 0.0, 0.9)])
+def test_shares_are_kept_to_a_drive_and_each_has_one(count, shares):
+    found = SplitConfig(shares).of(count).tolist()
+    for split, share in zip(dataset.SPLITS, shares, strict=True):
+        got = found.count(split)
+        assert (got > 0) == (share > 0)
+        # Those that get one in spite of a small share take it from others.
+        assert got >= share * count - 2 and got <= max(1, share * count + 1)
+
+
+def test_files_of_one_drive_are_shared_out_together(tmp_path):
+    for i in range(25):
+        write(tmp_path, f"{i:02d}.npz", **drives(count=1))
+    assert list(chain(*purposes(tmp_path).values())) == runs(20, 2, 3)
+    loaded, terrain = dataset.load_drives(tmp_path, "test")
+    # Of maps without a drive nothing is loaded.
+    assert len(loaded.length) == terrain.worlds == 3
+
+
+def test_few_drives_in_several_files_are_shared_out_together(tmp_path):
+    for name, count in (("a", 4), ("b", 1), ("c", 5)):
+        write(tmp_path, f"{name}.npz", **drives(count=count))
+    assert purposes(tmp_path) == {"a": runs(4), "b": runs(1), "c": runs(3, 1, 1)}
+
+
+def test_whole_worlds_are_shared_out(tmp_path):
+    hill = write(tmp_path) and tmp_path / "maps" / "hill.npz"
+    (tmp_path / "a.npz").unlink()
+    # Worlds of unequal numbers of drives; one of them in two files.
+    of = {"a": "m0", "b": "m1", "c": "m1", "d": "m2", "e": "m3", "f": "m4"}
+    for i, (name, ground) in enumerate(of.items()):
+        shutil.copy(hill, tmp_path / "maps" / f"{ground}.npz")
+        meta = np.array(json.dumps({"map": f"{ground}.npz"}))
+        write(tmp_path, f"{name}.npz", **drives(count=i + 1) | {"meta": meta})
+    found = purposes(tmp_path, SplitConfig(whole="worlds"))
+    assert {name: set(split) for name, split in found.items()} == {
+        **{name: {"train"} for name in "abcd"},
+        "e": {"validation"},
+        "f": {"test"},
+    }
+    collection = Collection.of(tmp_path, SplitConfig(whole="worlds"))
+    assert str(collection).endswith("10 train, 5 validation, 6 test (by share of worlds)")
+
+
+def test_what_files_say_is_kept(tmp_path):
+    said = np.array(["test", "train", "test"])
+    write(tmp_path, "a.npz", **drives(count=3), split=said)
+    write(tmp_path, "b.npz", **drives(count=10))
+    splits = SplitConfig((0.5, 0.0, 0.5))
+    expected = {"a": said.tolist(), "b": ["train"] * 5 + ["test"] * 5}
+    assert purposes(tmp_path, splits) == expected
+    loaded, _ = dataset.load_drives(tmp_path, "test", splits)
+    np.testing.assert_allclose(loaded.state[:2, 0, 6], [1.0, 1.2])
+    assert str(Collection.of(tmp_path, splits)) == (
+        f"{tmp_path}: 13 drives: 6 train, 0 validation, 7 test (as files say, by share of drives)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("split", "message"),
+    [
+        (np.array(["train", "tset", "test"]), "found tset"),
+        (np.array(["train"]), r"found \[1\]"),
+        (np.array([0, 1, 2]), "found 0"),
+        (np.array("train"), r"found \[\]"),
+    ],
+)
+def test_what_no_drive_is_for_is_refused(tmp_path, split, message):
+    path = write(tmp_path, **drives(count=3), split=split)
+    expected = "split: expected one of train, validation, test for each of 3 drives, "
+    with pytest.raises(DataError, match=f"{expected}{message}") as caught:
+        dataset.load_drives(tmp_path, "train")
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize("count", [24, 25])
+def test_what_the_shipped_models_learned_from_stays_as_it_was(tmp_path, count):
+    meta = np.array(json.dumps({"map": "hill.npz", "steering_amplitude": [0.2, 1.0]}))
+    write(tmp_path, **drives(count=count) | {"meta": meta})
+    found = purposes(tmp_path, SplitConfig((0.0, 0.5, 0.5)))["a"]
+    assert found == (runs(20, 2, 3) if count == 25 else runs(0, 12, 12))
+
+
+def test_the_drives_of_the_tests_and_the_open_ones_say_what_they_are_for():
+    tests = Path(__file__).parents[1] / "data" / "chrono_drives"
+    assert set(chain(*purposes(tests).values())) == {"train"}
+    everything = SplitConfig((0.0, 0.0, 1.0))
+    for kind in ("rigid", "deformable", "mixed"):
+        found = purposes(tests.parents[2] / "data" / "open" / kind, everything)
+        assert len(found) == 16 and all(split == runs(20, 2, 3) for split in found.values())
+
+
+def test_all_drives_are_taken_if_asked_for(tmp_path):
+    write(tmp_path)
+    loaded, _ = dataset.load_drives(tmp_path, "all")
+    np.testing.assert_array_equal(loaded.state, drives()["state"])
+
+
+@pytest.mark.parametrize(
+    ("shares", "found"),
+    [((0.8, 0.1, 0.2), "1.1"), ((1.0, 0.5, -0.5), "-0.5"), ((np.nan,) * 3, "nan")],
+)
+def test_shares_that_are_no_shares_are_refused(shares, found):
+    with pytest.raises(ConfigError, match=f"shares: expected .*, found .*{found}"):
+        SplitConfig(shares)
 
 
 def test_a_map_beside_the_collection_is_found(tmp_path):
@@ -43,10 +180,17 @@ def test_an_empty_folder_and_an_empty_split_are_refused(tmp_path):
     with pytest.raises(DataError, match=r"expected a folder with \.npz files"):
         dataset.load_drives(tmp_path, "test")
     write(tmp_path, **drives(count=3))
-    with pytest.raises(DataError, match="expected drives 22 to 24 of a file"):
-        dataset.load_drives(tmp_path, "test")
-    loaded, _ = dataset.load_drives(tmp_path, "train")
-    assert len(loaded.length) == 3
+    for split in dataset.SPLITS:
+        assert len(dataset.load_drives(tmp_path, split)[0].length) == 1
+    write(tmp_path, **drives(count=2))
+    for split in ("validation", "test"):
+        expected = f"expected drives of the {split} split, found none; record more"
+        with pytest.raises(DataError, match=expected) as caught:
+            dataset.load_drives(tmp_path, split)
+        told = f"{tmp_path}: 2 drives: 2 train, 0 validation, 0 test (too few to share out): "
+        assert str(caught.value).startswith(told)
+    for split in ("train", "all"):
+        assert len(dataset.load_drives(tmp_path, split)[0].length) == 2
 
 
 def test_no_folder_at_all_is_refused():

@@ -33,7 +33,7 @@ class Pull:
         return {"error": jnp.abs(params - self.target)}
 
 
-INPUTS = Inputs(Pull(), CONFIG, (0, 1), ("rigid",), (("a.npz", 10), ("b.npz", 20)))
+INPUTS = Inputs(Pull(), CONFIG, (0, 1), ("rigid",), (("a.npz", 10, 1), ("b.npz", 20, 2)))
 
 
 @pytest.fixture

@@ -3,7 +3,8 @@
 from vertiwm_jax import figures, runs
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.evaluation import plots
-from vertiwm_jax.learning import experiment
+from vertiwm_jax.learning import experiment, pipeline
+from vertiwm_jax.learning.dataset import SplitConfig
 from vertiwm_jax.learning.experiment import FitConfig
 
 ROLLOUTS = ("nesam_rollouts", "transformer_rollouts", "gate*")
@@ -24,5 +25,7 @@ def run(name: str, words: list[str]) -> None:
     figure = plots.learning_curves(curves, "updates", CURVES)
     figures.save(figure, folder / "learning_curves.png")
     print(f"the model is in {folder / 'model'}; how well it predicts:")
-    data = config.data[0]
-    print(f"python -m vertiwm_jax.evaluate prediction --compare {folder} --data {data}")
+    data, splits = pipeline.folders(config, pipeline.KINDS)[0], config.splits
+    shared = f" --splits.shares {' '.join(map(str, splits.shares))} --splits.whole {splits.whole}"
+    also = "" if splits == SplitConfig() else shared
+    print(f"python -m vertiwm_jax.evaluate prediction --compare {folder} --data {data}{also}")

@@ -9,6 +9,7 @@ from some drives and are tested on others, as in split conformal prediction with
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,12 +23,14 @@ from vertiwm_jax.evaluation.prediction import TestWindows, predict
 from vertiwm_jax.evaluation.tables import Row, markdown, write
 from vertiwm_jax.figures import line, sheet, style
 from vertiwm_jax.learning import dataset
+from vertiwm_jax.learning.dataset import Collection, SplitConfig
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.models.registry import load_model
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_log = logging.getLogger(__name__)
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 """Shares of predictions that a bound is to hold for."""
 PARTS = 5
@@ -44,6 +47,8 @@ class CalibrationTest:
 
     data: Path
     """Folder of `.npz` files of drives, with the maps they name."""
+    splits: SplitConfig = SplitConfig()
+    """How drives are shared out whose files do not say what they are for."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
     context: CountOrZero = 16
@@ -56,11 +61,15 @@ class CalibrationTest:
     def run(self) -> str:
         """Runs the test and writes what `output` asks for; returns the tables as Markdown."""
         lengths = self.context, self.horizon, self.horizon
+        collection = Collection.of(self.data, self.splits)
+        _log.info("%s", collection)
+        windows = []
+        for split in ("validation", "test"):
+            collection.expect(split, self.context + self.horizon)
+            drives = dataset.load_drives(self.data, split, self.splits)
+            windows.append(TestWindows.of(*drives, *lengths))
         model = load_model("vertiwm", self.weights)
-        (before, known), (error, disagreement) = (
-            signs(*model, TestWindows.of(*dataset.load_drives(self.data, split), *lengths))
-            for split in ("validation", "test")
-        )
+        (before, known), (error, disagreement) = (signs(*model, each) for each in windows)
         bounds = {name: Calibration.measure(before, signal) for name, signal in known.items()}
         best = next(iter(bounds))
         tables = parts(error, disagreement[best]), coverage(bounds, error, disagreement)

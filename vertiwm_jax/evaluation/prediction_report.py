@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +16,7 @@ from vertiwm_jax.evaluation import error_sources, plots, prediction, yardsticks
 from vertiwm_jax.evaluation.prediction import Predicted, TestWindows
 from vertiwm_jax.evaluation.tables import csv_text, markdown, write
 from vertiwm_jax.learning import dataset
+from vertiwm_jax.learning.dataset import Collection, SplitConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
 from vertiwm_jax.models.config import SoilSource
@@ -25,6 +27,7 @@ from vertiwm_jax.world_model.fusion import COEFFICIENTS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_log = logging.getLogger(__name__)
 Models = Annotated[tuple[ModelName, ...], AtLeastOne]
 SHARES = (0.25, 0.5, 0.75, 0.95)
 """Windows that are pictured: those than which this share of all on such ground err less."""
@@ -52,8 +55,10 @@ class PredictionTest:
     """Where the models have soils from, if not from where they had them when they were fitted."""
     compare: tuple[Path, ...] = ()
     """Run folders of `fit`, of which each part is a row."""
-    split: dataset.Split = "test"
-    """Which of the drives."""
+    split: dataset.Split | None = None
+    """Which of the drives; by default those to test, or all of too few to share out."""
+    splits: SplitConfig = SplitConfig()
+    """How drives are shared out whose files do not say what they are for."""
     context: CountOrZero = 16
     """Recorded steps that a model sees first."""
     horizons: Annotated[tuple[Count, ...], AtLeastOne] = (16,)
@@ -68,7 +73,11 @@ class PredictionTest:
 
     def run(self) -> str:
         """Runs the test and writes what is asked for; returns the tables as Markdown."""
-        drives, terrain = dataset.load_drives(self.data, self.split)
+        collection = Collection.of(self.data, self.splits)
+        split = self.split or ("test" if collection.divided else "all")
+        _log.info("%s; predicted: %s", collection, split)
+        collection.expect(split, self.context + max(self.horizons))
+        drives, terrain = dataset.load_drives(self.data, split, self.splits)
         every, tests = TestWindows.nested(drives, terrain, self.context, self.horizons, self.stride)
         driven = vehicle.load(self.vehicle).vehicle
         models: dict[str, tuple[Dynamics, Params]] = {
@@ -91,7 +100,7 @@ class PredictionTest:
             made = [
                 row
                 for name, each in cut.items()
-                for row in yardsticks.rows(name, each.states, test, self.split)
+                for row in yardsticks.rows(name, each.states, test, split)
             ]
             found += made
             tables.append(yardsticks.table(made))

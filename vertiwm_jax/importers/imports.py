@@ -17,7 +17,7 @@ from vertiwm_jax.importers.log import Log
 from vertiwm_jax.importers.resampling import Drive
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.learning import schema
-from vertiwm_jax.learning.dataset import SPLITS
+from vertiwm_jax.learning.dataset import SplitConfig
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.terrain import files, query
@@ -34,8 +34,6 @@ READERS: dict[str, Reader] = {
     ".mcap.zstd": rosbag.read,
 }
 """Formats of logs, by how their names end."""
-PER_FILE = SPLITS["test"].stop
-"""Drives in a file. The first of them are for training, the last for tests."""
 LARGEST_ANGLE = np.radians(20)
 """Between velocity and motion, in the median: another frame, or w before x, lie beyond."""
 
@@ -95,9 +93,8 @@ def import_drives(
         files.save(terrain, unfinished / "maps" / "map.npz")
         meta = {"sources": [str(path) for path in logs], "map": "map.npz"}
         wheels = settings.vehicle.wheels_in_body_xy
-        for number, first in enumerate(range(0, len(drives), PER_FILE)):
-            some = schema.in_file(_arrays(drives[first : first + PER_FILE]), terrain.offset())
-            schema.write(unfinished / f"drives_{number:03d}.npz", some, meta, wheels)
+        placed = schema.in_file(_arrays(drives), terrain.offset())
+        schema.write(unfinished / "drives.npz", placed, meta, wheels)
     remarks += [*refused.values(), *_remarks(drives, terrain, settings.vehicle.scale)]
     none = dict.fromkeys(next(iter(rows.values())), "-") | {"left out": "all"}
     table = [rows.get(path, none | {"log": str(path)}) for path in logs]
@@ -242,10 +239,9 @@ def _remarks(drives: Sequence[Drive], terrain: TerrainMap, scale: float) -> list
         f"the vehicle moves {np.degrees(axis_off):.1f} degrees off its x axis, in the median: "
         "more than 20 hint at another frame",
     ]
-    lacking = [split for split, indices in SPLITS.items() if len(drives) <= indices.start]
-    if lacking:
+    if SplitConfig().of(len(drives)) is None:
         lines.append(
-            f"{len(drives)} drives are too few for {' and '.join(lacking)}: expected "
-            f"{PER_FILE} or more; a smaller resampling.longest makes more of them"
+            f"{len(drives)} drives can be tested on, but are too few to fit to: a smaller "
+            "resampling.longest makes more of them"
         )
     return lines

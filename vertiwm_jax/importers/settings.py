@@ -81,8 +81,7 @@ class Resampling:
     shortest: int = 32
     """Drives of fewer steps are left out; a window of `fit` has 32."""
     longest: int = 250
-    """Drives of more steps are cut into equal pieces: `fit` learns from the first 20 drives of
-    each 25, and tests on the last 3."""
+    """Drives of more steps are cut into equal pieces, which are drives of their own."""
 
     def check(self):
         if not 1 <= self.shortest <= self.longest / 2:

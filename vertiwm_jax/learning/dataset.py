@@ -1,11 +1,12 @@
-"""Collections of recorded drives in memory: splits by drive and by world.
+"""Collections of recorded drives in memory, and what each drive is for.
 
 The format of the files is that of `vertiwm_jax.learning.schema`.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import jax
 import jax.numpy as jnp
@@ -13,19 +14,17 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax import geometry
+from vertiwm_jax.config import Share, settings
 from vertiwm_jax.learning import schema
-from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.learning.schema import SPLITS, DataError
 from vertiwm_jax.precision import float32
 from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain.map import TerrainMap, stack
 
-Split = Literal["train", "validation", "test"]
-SPLITS: dict[Split, range] = {
-    "train": range(20),
-    "validation": range(20, 22),
-    "test": range(22, 25),
-}
-"""Indices of the drives of each file in each split."""
+Split = Literal["train", "validation", "test", "all"]
+"""Which drives: those for one purpose, or all."""
+_IN_A_ROW = 25
+"""So neighbors, maybe pieces of one log, are mostly for the same; yet tests are from all of it."""
 
 Array = np.ndarray | jax.Array
 
@@ -67,15 +66,121 @@ class Drives:
     vehicles: tuple[str, ...] = struct.field(default=(), pytree_node=False)
 
 
+@settings
+class SplitConfig:
+    """How drives are shared out where their files do not say what each drive is for."""
+
+    shares: tuple[Share, Share, Share] = (0.8, 0.08, 0.12)
+    """Of drives to train, for validation and to test, of all files of a folder together."""
+    whole: Literal["drives", "worlds"] = "drives"
+    """What is never divided: drives, or all drives on the same map."""
+
+    def check(self):
+        if abs(sum(self.shares) - 1) > 1e-6:
+            raise ValueError(f"shares: expected a sum of 1, found {sum(self.shares):g}")
+
+    def of(self, count: int) -> np.ndarray | None:
+        """`[count]` what each of so many drives or worlds is for; None where they are too few.
+
+        Each purpose that has a share gets one at least. They are spread evenly, and of each 25 in a
+        row the first are to train and the last to test.
+        """
+        shares = np.array(self.shares)
+        quotas = (shares > 0).astype(int)
+        if quotas.sum() > count:
+            return None
+        for _ in range(count - quotas.sum()):
+            quotas[np.argmax(shares * count - quotas)] += 1
+        order, given = np.zeros(count, int), np.zeros(3, int)
+        for place in range(count):
+            order[place] = np.argmax(quotas * (place + 1) - given * count)
+            given[order[place]] += 1
+        for first in range(0, count, _IN_A_ROW):
+            order[first : first + _IN_A_ROW].sort()
+        return np.array(SPLITS)[order]
+
+
+@dataclass(frozen=True)
+class Collection:
+    """A folder of drives: how long they are, and what each is for.
+
+    lengths, purposes: `[K]` by file. decided: by what. divided: False where the drives are too few
+    to share out; then all are to train.
+    """
+
+    folder: Path
+    lengths: dict[Path, np.ndarray]
+    purposes: dict[Path, np.ndarray]
+    decided: str
+    divided: bool
+
+    @classmethod
+    def of(cls, folder: str | Path, splits: SplitConfig = SplitConfig()) -> Self:
+        """Of all `.npz` files in a folder; raises `DataError`."""
+        found = {path: schema.outline(path) for path in sorted(Path(folder).glob("*.npz"))}
+        if not found:
+            raise DataError(f"{folder}: expected a folder with .npz files of drives, found none")
+        lengths = {path: length for path, (length, _, _) in found.items()}
+        said = {path: split for path, (_, split, _) in found.items() if split is not None}
+        by_world = splits.whole == "worlds"
+        units = {
+            path: [ground if by_world else (path, drive) for drive in range(len(length))]
+            for path, (length, _, ground) in found.items()
+            if path not in said
+        }
+        every = list(dict.fromkeys(unit for own in units.values() for unit in own))
+        shared = splits.of(len(every))
+        divided = shared is not None or not units
+        purpose = dict(
+            zip(every, ["train"] * len(every) if shared is None else shared, strict=True)
+        )
+        given = {path: np.array([purpose[unit] for unit in own]) for path, own in units.items()}
+        decided = ["as files say"] if said else []
+        if units:
+            decided.append(f"by share of {splits.whole}" if divided else "too few to share out")
+        return cls(Path(folder), lengths, said | given, ", ".join(decided), divided)
+
+    def rows(self, path: Path, split: Split) -> np.ndarray:
+        """Which drives of a file are of a split."""
+        return np.flatnonzero((self.purposes[path] == split) | (split == "all"))
+
+    def longest(self, split: Split) -> int:
+        """Steps of the longest drive of a split; -1 if it has none."""
+        found = [length[self.rows(path, split)] for path, length in self.lengths.items()]
+        return int(np.concatenate(found).max(initial=-1))
+
+    def expect(self, split: Split, steps: int = 0) -> None:
+        """Raises `DataError` unless the split has a drive, and one of so many steps."""
+        if (longest := self.longest(split)) < 0:
+            raise DataError(
+                f"{self}: expected drives of the {split} split, found none; record more, or import "
+                "them in shorter pieces (resampling.longest); evaluate takes all by `--split all`"
+            )
+        if longest < steps:
+            raise DataError(
+                f"{self}: expected a drive of at least {steps} steps in the {split} split, found "
+                f"at most {longest}; record longer ones, or ask for less context or horizon"
+            )
+
+    def __str__(self) -> str:
+        every = np.concatenate(list(self.purposes.values())).tolist()
+        counts = ", ".join(f"{every.count(purpose)} {purpose}" for purpose in SPLITS)
+        return f"{self.folder}: {len(every)} drives: {counts} ({self.decided})"
+
+
 @float32
 def load_drives(
-    folders: str | Path | Sequence[str | Path], split: Split = "train"
+    folders: str | Path | Sequence[str | Path],
+    split: Split = "train",
+    splits: SplitConfig = SplitConfig(),
 ) -> tuple[Drives, TerrainMap]:
     """Loads recorded drives, and the maps that they were driven on.
 
     Args:
         folders: a folder of `.npz` files of drives, or several.
-        split: which drives of each file: `train`, `validation` or `test`.
+        split: which drives of each folder: those to `train`, for `validation` or to `test`, or
+            `all`.
+        splits: how the drives of a folder are shared out whose files do not say it.
 
     Returns:
         D drives at 10 Hz, of T steps at most: states `[D, T + 1, 12]` (position in m and roll,
@@ -83,29 +188,24 @@ def load_drives(
         body), commands `[D, T, 2]` (m/s, rad). And W worlds, of which `world` `[D]` is driven on.
 
     Raises:
-        DataError: a file is malformed, or has too few drives for this split.
+        DataError: a file is malformed, or a folder has too few drives for this split.
         MapError: a map is missing, malformed, or differs from the others in extent or classes.
     """
     paths: list[Path] = []
     parts: list[dict[str, np.ndarray]] = []
     maps: list[TerrainMap] = []
     for folder in [folders] if isinstance(folders, str | Path) else folders:
-        found = sorted(Path(folder).glob("*.npz"))
-        if not found:
-            raise DataError(f"{folder}: expected a folder with .npz files of drives, found none")
-        for path in found:
+        collection = Collection.of(folder, splits)
+        collection.expect(split)
+        for path in collection.lengths:
+            rows = collection.rows(path, split)
+            if not len(rows):
+                continue
             arrays, terrain = _read(path)
-            chosen = [i for i in SPLITS[split] if i < len(arrays["length"])]
-            picked = {name: array[chosen] for name, array in arrays.items()}
-            parts.append({**picked, "world": np.full(len(chosen), len(maps), np.int32)})
+            picked = {name: array[rows] for name, array in arrays.items()}
+            parts.append({**picked, "world": np.full(len(rows), len(maps), np.int32)})
             maps.append(terrain)
-        if not any(len(part["length"]) for part in parts[len(paths) :]):
-            indices = SPLITS[split]
-            raise DataError(
-                f"{folder}: expected drives {indices.start} to {indices.stop - 1} of a file for "
-                f"the {split} split, found fewer drives in every file"
-            )
-        paths += found
+            paths.append(path)
     if not paths:
         raise DataError("drives: expected a folder of drives or more, found none")
     return _join(paths, parts), stack(maps, [f"map of {path}" for path in paths])
@@ -119,8 +219,9 @@ def load_file(path: Path) -> tuple[Drives, TerrainMap]:
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], TerrainMap]:
-    """The arrays of all drives of a file and its map."""
+    """The arrays of all drives of a file, without what they are for, and its map."""
     arrays, meta = schema.read(path)
+    arrays.pop("split", None)
     terrain = files.load_map(schema.find_map(path, meta["map"]))
     arrays = schema.check(path, arrays, terrain.offset())
     _check_place(path, arrays, terrain)

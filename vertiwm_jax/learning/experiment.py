@@ -48,6 +48,8 @@ def run(config: FitConfig) -> Path:
     """
     keep_compiled(config.compile_cache)
     start = _start(config)
+    for collection in pipeline.expect_drives(config):
+        _log.info("%s", collection)
     with Run.begin(config, config.name, project=config.wandb) as run:
         _log.info("run folder %s", run.folder)
         params = pipeline.fit(config, run, start)

@@ -17,7 +17,7 @@ import numpy as np
 from vertiwm_jax.config import settings
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning import autoencoders, calibration, dataset, stages, windows
-from vertiwm_jax.learning.dataset import Drives, Split, WheelSignals
+from vertiwm_jax.learning.dataset import Collection, Drives, Split, SplitConfig, WheelSignals
 from vertiwm_jax.learning.fitting import FitConfig, Problem
 from vertiwm_jax.learning.losses import LossConfig
 from vertiwm_jax.learning.objectives import RolloutLoss, TeacherForcingLoss
@@ -85,6 +85,8 @@ class PipelineConfig:
     """Folders of more drives beside those, such as a policy has driven (`collect --policy`)."""
     reuse: tuple[Path, ...] = ()
     """Folders of earlier runs, whose stages are taken over where their inputs are the same."""
+    splits: SplitConfig = SplitConfig()
+    """How drives are shared out whose files do not say what they are for."""
     seed: int = 0
     """Decides everything that is random."""
     model: ModelConfig = ModelConfig()
@@ -124,6 +126,37 @@ class PipelineConfig:
                 f"gate.rollouts.trainable: expected nothing but gates where there are "
                 f"{self.model.gates}, found {', '.join(learned)}"
             )
+
+
+def expect_drives(config: PipelineConfig) -> list[Collection]:
+    """The collections that all is fitted to.
+
+    Raises `DataError` unless each has drives to train and to validate on, and one is long enough.
+    """
+    for name in config.model.parts:
+        folders(config, getattr(config, name).learns_from)
+    found = [Collection.of(folder, config.splits) for folder in folders(config, KINDS)]
+    splits: tuple[Split, ...] = ("train", "validation")
+    for split in splits:
+        for collection in found:
+            collection.expect(split)
+        longest = max(found, key=lambda collection: collection.longest(split))
+        longest.expect(split, config.windows.context + config.windows.horizon)
+    return found
+
+
+def folders(config: PipelineConfig, kinds: Sequence[Kind]) -> list[Path]:
+    """Those with drives of these kinds, and those that are not divided into kinds."""
+    chosen, given = list[Path](), config.data + config.add
+    for folder in given:
+        chosen += [folder] if any(folder.glob("*.npz")) else []
+        chosen += [folder / kind for kind in kinds if (folder / kind).is_dir()]
+    if not chosen:
+        raise DataError(
+            f"{', '.join(map(str, given))}: expected files of drives, or folders of "
+            f"them named {' or '.join(kinds)}, found neither"
+        )
+    return chosen
 
 
 def fit(config: PipelineConfig, run: Run, start: VertiWMParams | None = None) -> VertiWMParams:
@@ -268,8 +301,14 @@ class _Pipeline:
         data: Callable[[], Any],
     ) -> Any:
         """The fitted parameters of a stage, on which the next one builds."""
-        files = [file for folder in self._folders(KINDS) for file in sorted(folder.glob("*.npz"))]
-        drives = tuple((file.name, file.stat().st_size) for file in files)
+        found = [
+            Collection.of(folder, self.config.splits) for folder in folders(self.config, KINDS)
+        ]
+        drives = tuple(
+            (file.name, file.stat().st_size, zlib.crc32(" ".join(purposes).encode()))
+            for collection in found
+            for file, purposes in collection.purposes.items()
+        )
         key = self._key(name)
         seed = tuple(jax.random.key_data(key).tolist())
         inputs = Inputs(problem, config, seed, tuple(kinds), drives, self.before)
@@ -287,21 +326,11 @@ class _Pipeline:
         """Drives of these kinds in all folders, and of folders that are not divided into kinds."""
         key = tuple(kinds), split
         if key not in self.loaded:
-            drives, terrain = dataset.load_drives(self._folders(kinds), split)
+            drives, terrain = dataset.load_drives(
+                folders(self.config, kinds), split, self.config.splits
+            )
             self.loaded[key] = replace(drives, wheels=WheelSignals()), terrain
         return self.loaded[key]
-
-    def _folders(self, kinds: Sequence[Kind]) -> list[Path]:
-        chosen, given = list[Path](), self.config.data + self.config.add
-        for folder in given:
-            chosen += [folder] if any(folder.glob("*.npz")) else []
-            chosen += [folder / kind for kind in kinds if (folder / kind).is_dir()]
-        if not chosen:
-            raise DataError(
-                f"{', '.join(map(str, given))}: expected files of drives, or folders of "
-                f"them named {' or '.join(kinds)}, found neither"
-            )
-        return chosen
 
     def _sample(self, kinds: Sequence[Kind]) -> tuple[TerrainMap, Windows]:
         """Some windows of the training drives, as a measurement takes them, and their ground."""

@@ -17,6 +17,12 @@ and, as far as they were recorded (wheels in the order FL, FR, RL, RR),
     wheel_force    [K, T + 1, 4, 3]  ground on wheel, world frame, N, mean over the last step
     chassis_force  [K, T + 1, 3]     ground on belly, the same
     steer_angle    [K, T + 1, 2]     front-left and front-right wheel, rad
+    split          [K]               what each drive is for: "train", "validation" or "test";
+                                     without it, drives are shared out (`dataset.SplitConfig`)
+
+Files of 25 drives whose meta has "steering_amplitude" are those of Chrono that the shipped models
+learned from. They are older than `split` and say it so: 20 drives to train, 2 to validate, 3 to
+test, in this order.
 
 Numbers may be of any precision. Arrays of other names are not read. Maps lie in a folder `maps`
 inside the collection or beside it. Positions are in the coordinates of the map's file: where these
@@ -36,6 +42,8 @@ from vertiwm_jax import atomic
 from vertiwm_jax.errors import UserError, refusing
 from vertiwm_jax.state import STEP_SECONDS
 
+SPLITS = "train", "validation", "test"
+"""What drives are for."""
 WHEEL_SIGNALS = {
     "wheel_omega": (4,),
     "wheel_sinkage": (4,),
@@ -47,7 +55,9 @@ WHEEL_SIGNALS = {
 UNNAMED = "unnamed"
 """A vehicle whose name no file says."""
 _REQUIRED = {"state": (12,), "control": (2,), "length": ()}
-_SHAPES = {**_REQUIRED, "wheel_class": (4,), **WHEEL_SIGNALS}
+_SHAPES = {**_REQUIRED, "wheel_class": (4,), **WHEEL_SIGNALS, "split": ()}
+_EARLIER = np.repeat(SPLITS, (20, 2, 3))
+"""What the drives of files are for that are older than `split`."""
 _ALL = slice(None)
 _LIMITS = (
     ("state", slice(0, 3), 1e5, "position in m"),
@@ -80,15 +90,44 @@ def read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     Raises `DataError` unless they are there. What they hold needs the map: see `check` and
     `check_classes`.
     """
+    found = _stored(path, (*_SHAPES, "meta"), (*_REQUIRED, "meta"))
+    meta = str(found.pop("meta"))
+    return found, _parse(path, meta, "wheel_class" in found)
+
+
+def outline(path: Path) -> tuple[np.ndarray, np.ndarray | None, str]:
+    """Of the drives of a file: `[K]` lengths, `[K]` what each is for if the file says it, its map.
+
+    For what is to be known before drives are read. Raises `DataError`.
+    """
+    found = _stored(path, ("length", "split", "meta"), ("length", "meta"))
+    length, meta = found["length"], _parse(path, str(found["meta"]), classes_known=True)
+    whole = length.dtype.kind in "iu" and length.ndim == 1
+    if not (whole and len(length) and length.min() >= 0):
+        check(path, read(path)[0], np.zeros(2))  # Says what is wrong.
+    split = found.get("split")
+    if split is not None:
+        unknown = [str(found) for found in split.flat if found not in SPLITS]
+        if split.shape != length.shape or unknown:
+            raise DataError(
+                f"{path}: split: expected one of {', '.join(SPLITS)} for each of {len(length)} "
+                f"drives, found {unknown[0] if unknown else list(split.shape)}"
+            )
+    elif len(length) == len(_EARLIER) and "steering_amplitude" in meta:
+        split = _EARLIER
+    return length, split, meta["map"]
+
+
+def _stored(path: Path, names: Sequence[str], required: Sequence[str]) -> dict[str, np.ndarray]:
+    """The arrays of these names, as far as the file has them."""
     expected = f"{path}: expected an .npz archive of plain arrays"
     refused = refusing(lambda found: DataError(f"{expected}: {found}"))
     with refused, np.load(path, allow_pickle=False) as archive:
-        found = {name: archive[name] for name in (*_SHAPES, "meta") if name in archive}
-    missing = [name for name in (*_REQUIRED, "meta") if name not in found]
+        found = {name: archive[name] for name in names if name in archive}
+    missing = [name for name in required if name not in found]
     if missing:
         raise DataError(f"{path}: missing {', '.join(missing)}; found {list(found)}")
-    meta = str(found.pop("meta"))
-    return found, _parse(path, meta, "wheel_class" in found)
+    return found
 
 
 def vehicle_name(path: Path) -> str:
@@ -182,7 +221,7 @@ def check(
         raise DataError(f"{path}: control: expected shape [K, T, 2], found {found}")
     drives, steps, _ = arrays["control"].shape
     for name, array in arrays.items():
-        axes = {"length": (), "control": (steps,)}.get(name, (steps + 1,))
+        axes = {"length": (), "split": (), "control": (steps,)}.get(name, (steps + 1,))
         wanted = (drives, *axes, *_SHAPES[name])
         if array.shape != wanted:
             raise DataError(

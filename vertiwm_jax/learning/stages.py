@@ -27,15 +27,16 @@ INPUTS = "inputs.txt"
 class Inputs:
     """Everything that the result of a stage depends on, except program and machine.
 
-    learns_from: kinds of drives; drives: all files of drives with their sizes, since the constants
-        of a model are measured on them. before: `digest` of the stages that it builds on.
+    learns_from: kinds of drives; drives: all files of drives with their sizes and a digest of what
+        their drives are for, since the constants of a model are measured on them. before: `digest`
+        of the stages that it builds on.
     """
 
     problem: Problem
     config: FitConfig
     seed: tuple[int, ...]
     learns_from: tuple[str, ...]
-    drives: tuple[tuple[str, int], ...]
+    drives: tuple[tuple[str, int, int], ...]
     before: tuple[str, ...] = ()
 
     def __str__(self) -> str:

@@ -73,7 +73,7 @@ class CollectConfig:
     repeats: Count = 1
     """How many of each."""
     drives: Count = 25
-    """Drives on each world; `fit` learns from the first 20, and tests on 22 to 24."""
+    """Drives on each world."""
     seconds: Annotated[float, Bounds("at least 0.1", lambda x: x >= STEP_SECONDS)] = 25.0
     """Duration of a drive."""
     policy: Path | None = None
