@@ -65,7 +65,7 @@ class CalibrationTest:
         _log.info("%s", collection)
         windows = []
         for split in ("validation", "test"):
-            collection.expect(split, self.context + self.horizon)
+            dataset.expect_drives([collection], split, self.context + self.horizon)
             drives = dataset.load_drives(self.data, split, self.splits)
             windows.append(TestWindows.of(*drives, *lengths))
         model = load_model("vertiwm", self.weights)

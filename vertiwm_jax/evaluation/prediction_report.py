@@ -73,10 +73,12 @@ class PredictionTest:
 
     def run(self) -> str:
         """Runs the test and writes what is asked for; returns the tables as Markdown."""
-        collection = Collection.of(self.data, self.splits)
-        split = self.split or ("test" if collection.divided else "all")
-        _log.info("%s; predicted: %s", collection, split)
-        collection.expect(split, self.context + max(self.horizons))
+        collections = [Collection.of(folder, self.splits) for folder in self.data]
+        divided = any(collection.divided for collection in collections)
+        split = self.split or ("test" if divided else "all")
+        for collection in collections:
+            _log.info("%s; predicted: %s", collection, split)
+        dataset.expect_drives(collections, split, self.context + max(self.horizons))
         drives, terrain = dataset.load_drives(self.data, split, self.splits)
         every, tests = TestWindows.nested(drives, terrain, self.context, self.horizons, self.stride)
         driven = vehicle.load(self.vehicle).vehicle

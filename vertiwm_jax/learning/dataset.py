@@ -149,23 +149,29 @@ class Collection:
         found = [length[self.rows(path, split)] for path, length in self.lengths.items()]
         return int(np.concatenate(found).max(initial=-1))
 
-    def expect(self, split: Split, steps: int = 0) -> None:
-        """Raises `DataError` unless the split has a drive, and one of so many steps."""
-        if (longest := self.longest(split)) < 0:
-            raise DataError(
-                f"{self}: expected drives of the {split} split, found none; record more, or import "
-                "them in shorter pieces (resampling.longest); evaluate takes all by `--split all`"
-            )
-        if longest < steps:
-            raise DataError(
-                f"{self}: expected a drive of at least {steps} steps in the {split} split, found "
-                f"at most {longest}; record longer ones, or ask for less context or horizon"
-            )
-
     def __str__(self) -> str:
         every = np.concatenate(list(self.purposes.values())).tolist()
         counts = ", ".join(f"{every.count(purpose)} {purpose}" for purpose in SPLITS)
         return f"{self.folder}: {len(every)} drives: {counts} ({self.decided})"
+
+
+def expect_drives(collections: Sequence[Collection], split: Split, steps: int = 0) -> None:
+    """Raises `DataError` unless each has a drive of the split, and one of them so many steps."""
+    if not collections:
+        raise DataError("drives: expected a folder of drives or more, found none")
+    for collection in collections:
+        if collection.longest(split) < 0:
+            raise DataError(
+                f"{collection}: expected drives of the {split} split, found none; record more, or "
+                "import them in shorter pieces (resampling.longest); evaluate takes all by "
+                "`--split all`"
+            )
+    of = max(collections, key=lambda collection: collection.longest(split))
+    if of.longest(split) < steps:
+        raise DataError(
+            f"{of}: expected a drive of at least {steps} steps in the {split} split, found at most "
+            f"{of.longest(split)}; record longer ones, or ask for less context or horizon"
+        )
 
 
 @float32
@@ -194,9 +200,10 @@ def load_drives(
     paths: list[Path] = []
     parts: list[dict[str, np.ndarray]] = []
     maps: list[TerrainMap] = []
-    for folder in [folders] if isinstance(folders, str | Path) else folders:
-        collection = Collection.of(folder, splits)
-        collection.expect(split)
+    given = [folders] if isinstance(folders, str | Path) else folders
+    collections = [Collection.of(folder, splits) for folder in given]
+    expect_drives(collections, split)
+    for collection in collections:
         for path in collection.lengths:
             rows = collection.rows(path, split)
             if not len(rows):
@@ -206,8 +213,6 @@ def load_drives(
             parts.append({**picked, "world": np.full(len(rows), len(maps), np.int32)})
             maps.append(terrain)
             paths.append(path)
-    if not paths:
-        raise DataError("drives: expected a folder of drives or more, found none")
     return _join(paths, parts), stack(maps, [f"map of {path}" for path in paths])
 
 

@@ -138,10 +138,7 @@ def expect_drives(config: PipelineConfig) -> list[Collection]:
     found = [Collection.of(folder, config.splits) for folder in folders(config, KINDS)]
     splits: tuple[Split, ...] = ("train", "validation")
     for split in splits:
-        for collection in found:
-            collection.expect(split)
-        longest = max(found, key=lambda collection: collection.longest(split))
-        longest.expect(split, config.windows.context + config.windows.horizon)
+        dataset.expect_drives(found, split, config.windows.context + config.windows.horizon)
     return found
 
 
