@@ -127,6 +127,7 @@ SHORTENED = {
     "collect": "--seconds 6 --kinds mixed --difficulties low --repeats 1",
     "fit": "--config fit.yaml",
     "evaluate prediction": "--stride 400",
+    "evaluate floor": "--every 40",
     "evaluate navigation": "",
     "export": "",
     "view": "",

@@ -107,6 +107,28 @@ def test_a_start_forgets_the_drive_before(kind):
     jax.tree.map(np.testing.assert_array_equal, first, again)
 
 
+@pytest.mark.parametrize("kind", SIMULATORS)
+def test_a_push_moves_the_whole_vehicle(kind):
+    commands, pushed = np.tile([3.0, 0.1], (10, 1)), np.array([0.02, -0.01, 0.0])
+    simulator, start = kind(ground()), (160.0, 5.0, 1.0)
+    straight = drive(simulator, start, commands)
+    simulator.start(*start)
+    for command in commands[:6]:
+        simulator.step(command)
+    simulator.push(np.array([0.3, -0.2, 0.0]), pushed)
+    after = [simulator.step(command).state for command in commands[6:]]
+    # It goes on as it would have, from where it is; what the push adds soon goes into the tires.
+    apart = np.array(after) - straight.state[7:]
+    np.testing.assert_allclose(apart[:, :3], np.tile([0.3, -0.2, 0.0], (4, 1)), atol=0.006)
+    np.testing.assert_allclose(apart[:, 3:6], 0.0, atol=0.01)
+    assert np.linalg.norm(apart[0, :3] - [0.3, -0.2, 0.0]) > 1e-5
+    simulator.start(*start)
+    for command in commands[:6]:
+        simulator.step(command)
+    simulator.push(np.zeros(3), np.zeros(3))
+    np.testing.assert_array_equal(simulator.step(commands[6]).state, straight.state[7])
+
+
 @pytest.mark.integration
 def test_the_built_in_simulator_is_the_one_inside_jit():
     terrain, model, params = ground(slope=0.1, east=SAND), Simulator(), chrono_like(load_vehicle())

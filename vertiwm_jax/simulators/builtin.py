@@ -1,5 +1,7 @@
 """The built-in simulator behind the interface of simulators outside jit."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,6 +46,13 @@ class BuiltIn:
         command = np.asarray(command, np.float32)
         self._moving, seen = _step(self._params, self._terrain, self._moving, command)
         return jax.device_get(seen)
+
+    def push(self, moved: np.ndarray, pushed: np.ndarray) -> None:
+        """Moves the vehicle, `[3]` m, and adds to its velocity, `[3]` m/s, in the world frame."""
+        state, history = self._moving
+        turned = geometry.rotation_from_rpy(state.rpy).inverse() @ jnp.float32(pushed)
+        position, velocity = state.position + jnp.float32(moved), state.velocity + turned
+        self._moving = replace(state, position=position, velocity=velocity), history
 
 
 @jax.jit

@@ -83,6 +83,11 @@ class Chrono:
         self._drive.advance(speed, min(max(steering / lock, -1.0), 1.0))
         return self._observe(self._drive)
 
+    def push(self, moved: np.ndarray, pushed: np.ndarray) -> None:
+        """Moves the vehicle, `[3]` m, and adds to its velocity, `[3]` m/s, in the world frame."""
+        assert self._drive, "expected start before push"
+        self._drive.push(moved.tolist(), pushed.tolist())
+
     def _observe(self, drive: "_Drive") -> Observation:
         pose, twist, wheels, signals = drive.read()
         pose[:2] += self._ground.middle
@@ -196,6 +201,14 @@ class _Drive:
             self._system.DoStepDynamics(STEP)
             total += self._contact_forces()
         self._forces = total / SUBSTEPS
+
+    def push(self, moved: list[float], pushed: list[float]) -> None:
+        """Moves all bodies alike, so that none of their joints notices."""
+        vector = self._chrono.ChVector3d
+        for body in self._system.GetBodies():
+            if not body.IsFixed():
+                body.SetPos(body.GetPos() + vector(*moved))
+                body.SetPosDt(body.GetPosDt() + vector(*pushed))
 
     def _contact_forces(self) -> np.ndarray:
         """`[5, 3]` N on the wheels and the chassis over the last simulation step, world frame."""
