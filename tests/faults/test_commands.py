@@ -12,12 +12,13 @@ from doors import door, refusal
 from faults.border import fault
 from learning import recordings
 
+from vertiwm_jax.env.navigation import make_env
 from vertiwm_jax.evaluation import calibration, prediction, prediction_report, report
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning import experiment as fitting
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.terrain import files
-from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.map import MapError, TerrainMap
 
 GRASS = 3
 TESTS = Path(__file__).resolve().parents[1]
@@ -137,18 +138,30 @@ def test_an_unwritable_output_is_refused_first(tmp_path, monkeypatch, command):
 SMALL = {
     "evaluate": (door("evaluate"), ["navigation", "--policy", "straight"]),
     "ppo": (door("ppo"), ["--model", "builtin"]),
+    "collect": (door("collect"), ["--output", "DRIVES"]),
 }
 
 
 @pytest.mark.parametrize("name", SMALL)
-@fault(AssertionError, "a map that is too small is told as tasks that cannot be driven")
 def test_a_map_that_is_too_small_is_called_so(tmp_path, name):
     command, argv = SMALL[name]
-    small = maps(tmp_path / "worlds", size=21, count=5)
+    side = 10 if name == "collect" else 20
+    small = maps(tmp_path / "worlds", size=side + 1, count=5)
     message = refusal(command, *argv, "--terrain", small).removeprefix("error: ")
     # Its name and its size, and not the coordinates of a task.
-    assert message.startswith(str(small)) and "20" in message.removeprefix(str(small))
+    assert message.startswith(str(small))
+    found = message.removeprefix(str(small))
+    assert "size: expected at least" in found and f"found {side} m x {side} m" in found
     assert "tasks." not in message
+
+
+def test_the_smallest_map_holds_tasks(tmp_path):
+    door("evaluate")(
+        ["navigation", "--policy", "straight", "--terrain", str(maps(tmp_path / "worlds", 33))]
+    )
+    small = TerrainMap.from_array(np.ones((21, 21)))
+    with pytest.raises(MapError, match=r"^map: size: expected at least 32 m x 32 m"):
+        make_env(small)
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ from vertiwm_jax.precision import float32
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import obstacles, patches, query, sensing
 from vertiwm_jax.terrain.files import load_map
-from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.map import TerrainMap, expect_room
 
 _Placed = tuple[VehicleState, History]
 
@@ -386,7 +386,7 @@ def make_env(
         reward, whether the episode is over, and `info`.
 
     Raises:
-        TaskError: a task cannot be driven on the map.
+        MapError, TaskError: a map is too small, or a task on it cannot be driven.
         ConfigError, CheckpointError: there is no such vehicle, or no such model.
     """
     driven = load_vehicle(vehicle) if isinstance(vehicle, str) else vehicle
@@ -395,7 +395,8 @@ def make_env(
     if terrain is None:
         terrain = suites.suite_worlds(GroundConfig(suite_worlds=2), jax.random.key(seed))
     elif not isinstance(terrain, TerrainMap):
-        terrain = load_map(terrain)
+        terrain = load_map(terrain, least=suites.SMALLEST)
+    expect_room(terrain, suites.SMALLEST, "map")
     encoders = load_encoders(weights) if config.embeddings else None
     tasks = suites.test_tasks(GroundConfig(pairs=pairs), terrain)
     return env, env.make_params(params, terrain, tasks, driven, encoders)

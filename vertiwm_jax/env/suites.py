@@ -31,6 +31,8 @@ SUITES: dict[Suite, WorldConfig] = {
     "obstacles": WorldConfig(difficulties=("low", "mid"), rocks=20, trees=2),
 }
 """Procedural worlds to test on; Verti-Bench's have 10, 20 or 40 rocks and a tree for each ten."""
+SMALLEST = 32.0
+"""Least side of a map that holds tasks, m: starts on its circle then lie 1 m inside."""
 _SURROUNDINGS = 4.0  # m
 _SWAYS = 13  # places that a pair of the circle may turn to
 # Of random tasks:

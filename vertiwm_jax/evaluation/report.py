@@ -19,7 +19,7 @@ from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.episodes import NavigationResult, run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.suites import Suite, test_tasks
+from vertiwm_jax.env.suites import SMALLEST, Suite, test_tasks
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation import external, navigation, plots, tables
 from vertiwm_jax.planning.improvement import ImprovementConfig
@@ -108,7 +108,9 @@ class NavigationTest:
         external.expect(self.simulator, config)
         if self.terrain:
             scale = config.driven.scale
-            terrain = files.load_map(self.terrain, scale=scale, obstacles=self.obstacles)
+            terrain = files.load_map(
+                self.terrain, scale=scale, obstacles=self.obstacles, least=SMALLEST
+            )
         else:
             terrain = experiment.held_out(config)
         policies = dict(config.baselines)

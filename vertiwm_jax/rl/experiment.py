@@ -33,7 +33,7 @@ from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
 from vertiwm_jax.rl.td3 import TD3, TD3Config
 from vertiwm_jax.runs import Run
-from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.map import TerrainMap, expect_room
 from vertiwm_jax.training import LoopConfig, Seeds, Work, keep_compiled
 
 Rows = dict[str, Policy | Agent]
@@ -218,6 +218,7 @@ def training_ground(
     navigation, driven = config.navigation, config.driven
     asked = config.ground, config.terrain, config.key("worlds"), driven.scale
     terrain, held_out = (worlds, worlds) if worlds else suites.grounds(*asked)
+    expect_room(terrain, suites.SMALLEST, "map" if worlds else str(config.terrain))
     # Now, and not when the training is over.
     tests = suites.test_tasks(config.ground, held_out)
     suites.validate(tests, held_out, navigation.goal_radius, navigation.map_margin)
@@ -230,7 +231,9 @@ def held_out(config: TaskConfig) -> TerrainMap:
     key, scale = config.key("worlds"), config.driven.scale
     if config.terrain is None:
         return suites.suite_worlds(config.ground, key, scale)
-    return suites.grounds(config.ground, config.terrain, key, scale)[1]
+    terrain = suites.grounds(config.ground, config.terrain, key, scale)[1]
+    expect_room(terrain, suites.SMALLEST, str(config.terrain))
+    return terrain
 
 
 def environment(

@@ -182,7 +182,8 @@ def record(
 def _terrain(config: CollectConfig, scale: float) -> TerrainMap:
     """All worlds to drive on."""
     if config.terrain:
-        return files.load_map(config.terrain, scale=scale, obstacles=config.obstacles)
+        least = excitation.SMALLEST
+        return files.load_map(config.terrain, scale=scale, obstacles=config.obstacles, least=least)
     count = config.repeats * len(config.difficulties) * len(config.kinds)
     drawn = WorldConfig(config.difficulties, config.kinds)
     return worlds.make_worlds(count, config.seed, drawn, scale=scale)

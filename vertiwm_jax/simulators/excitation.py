@@ -14,6 +14,8 @@ from vertiwm_jax.terrain.map import TerrainMap
 
 MARGIN = 3.0
 """m from the edge of the map at which a drive ends; starts and goals keep 2 m more."""
+SMALLEST = 20.0
+"""Least side of a map to record drives on, m: half of it is room for starts."""
 _USUAL_SPEED = 2.5  # m/s, straight on for a whole drive is the room that a start should have
 _CANDIDATES = 2000
 _STEEPEST_START = np.tan(np.radians(20))

@@ -18,7 +18,7 @@ from vertiwm_jax.precision import float32
 from vertiwm_jax.terrain import geotiff, query, soil, vertibench
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.geotiff import Raster
-from vertiwm_jax.terrain.map import MapError, TerrainMap, stack
+from vertiwm_jax.terrain.map import MapError, TerrainMap, expect_room, stack
 from vertiwm_jax.terrain.soil import Soil
 
 # How Chrono calls our soil parameters, and how many of its units make one of ours.
@@ -34,13 +34,16 @@ _SOIL_FIELDS = {
 
 
 @float32
-def load_map(path: str | Path, *, scale: float = 1.0, obstacles: bool = True) -> TerrainMap:
+def load_map(
+    path: str | Path, *, scale: float = 1.0, obstacles: bool = True, least: float = 0.0
+) -> TerrainMap:
     """Loads a map, or all maps of a folder.
 
     Args:
         path: an `.npz` map, a folder of them, or a checkout of Verti-Bench.
         scale: of a small vehicle, as in its file; the ground becomes as large as it does.
         obstacles: whether the rocks and trees of the maps stand there.
+        least: m that each side has at least, as large as the ground becomes.
 
     Returns:
         W worlds, stacked in the order of their names, of which the first is selected. Soils come
@@ -48,7 +51,8 @@ def load_map(path: str | Path, *, scale: float = 1.0, obstacles: bool = True) ->
         the same name.
 
     Raises:
-        MapError: a file is missing or malformed; the message names it and the field.
+        MapError: a file is missing or malformed, or the map too small; the message names it and
+            the field.
     """
     path = Path(path)
     if not path.exists():
@@ -63,6 +67,8 @@ def load_map(path: str | Path, *, scale: float = 1.0, obstacles: bool = True) ->
     else:
         terrain = _load_world(path)
     terrain = froude.scaled(terrain, scale)
+    at_scale = "" if scale == 1 else f", {scale:g} times as large"
+    expect_room(terrain, least, f"{path}{at_scale}")
     return terrain if obstacles else replace(terrain, obstacles=terrain.obstacles[:, :0])
 
 

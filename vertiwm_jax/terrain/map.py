@@ -312,6 +312,15 @@ def _soils_by_world(terrain: TerrainMap) -> Soil:
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape), terrain.soils)
 
 
+def expect_room(terrain: TerrainMap, least: float, name: str) -> None:
+    """Raises `MapError` unless each side of the map is `least` m long."""
+    width, height = terrain.size.tolist()
+    if min(width, height) < least:
+        expected = f"at least {least:g} m x {least:g} m, to hold starts and goals"
+        found = f"{width:g} m x {height:g} m"
+        raise MapError(name, "size", expected, found, "make a larger map")
+
+
 def bounded(name: str, field: str, shape: Sequence[int]) -> None:
     """Raises `MapError` where an array of this shape would be too large to be read."""
     if math.prod(shape) > MOST:
