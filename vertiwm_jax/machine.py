@@ -13,9 +13,34 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertiwm_jax import hosts, xla
+from vertiwm_jax.errors import UserError
 
 _PATIENCE = 7 * 24 * 3600  # seconds
 _WORTH_ROUNDING = 0.75  # of the time; 0.55 was measured with AVX512_BF16, above 1.5 without
+
+
+_process = os.getpid()
+"""In which JAX may start, or has started."""
+
+
+def refuse_forked() -> None:
+    """`UserError` in a process that was forked from one in which JAX had started.
+
+    JAX would wait for ever for threads that only the other process has.
+    """
+    global _process
+    if os.getpid() == _process:
+        return
+    devices = jax.config.read("jax_num_cpu_devices")
+    try:
+        jax.config.update("jax_num_cpu_devices", devices + 1)
+    except RuntimeError:  # It cannot be changed after JAX has started.
+        raise UserError(
+            "processes: JAX has started before this process was forked, and does not run in it; "
+            'start processes by multiprocessing.get_context("spawn"), or context="spawn"'
+        ) from None
+    jax.config.update("jax_num_cpu_devices", devices)
+    _process = os.getpid()
 
 
 def cores() -> int:

@@ -182,8 +182,5 @@ def forked(tmp_path_factory):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
 @pytest.mark.parametrize("command", ["collect", "evaluate"])
-@fault(TimeoutError, "JAX waits for threads that a forked process does not have")
 def test_a_forked_process_says_that_it_cannot_go_on(forked, command):
-    if forked[command] is None:
-        raise TimeoutError(command)
-    assert "spawn" in forked[command] and "\n" not in forked[command]
+    assert forked[command] and "spawn" in forked[command] and "\n" not in forked[command]

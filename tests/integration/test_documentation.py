@@ -24,9 +24,21 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 ELSEWHERE = ("rclpy",)
 """What stands in blocks that only run on a robot."""
-OPTIONAL = {"simulators.chrono": "pychrono", "stable_baselines3": "stable_baselines3"}
+OPTIONAL = {
+    "simulators.chrono": "pychrono",
+    "stable_baselines3": "stable_baselines3",
+    "rejax": "rejax",
+}
 """What a block that says so needs, and is skipped without."""
-LONG = ("MPPI", "vw.train", "stable_baselines3", "SoilFilter", "jacfwd", "prediction_errors")
+LONG = (
+    "MPPI",
+    "vw.train",
+    "stable_baselines3",
+    "rejax",
+    "SoilFilter",
+    "jacfwd",
+    "prediction_errors",
+)
 """What stands in blocks that take more than a minute."""
 
 

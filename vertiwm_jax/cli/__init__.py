@@ -49,6 +49,7 @@ def main(name: str | None = None, words: Sequence[str] | None = None) -> None:
     if own:
         prepare(name)
     with failures_in_one_line(name), told():
+        machine.refuse_forked()
         module = "train" if name in _TRAININGS else name
         import_module(f"{__name__}.{module}").run(name, words)
 

@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from gymnax.environments.spaces import gymnax_space_to_gym_space
 
+from vertiwm_jax import machine
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason
@@ -71,7 +72,13 @@ class NavigationGymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Draws a start from the pool. There are no options: `ValueError`."""
+        """Draws a start from the pool.
+
+        Raises:
+            ValueError: an option is given, and there is none.
+            UserError: this process was forked after JAX had started.
+        """
+        machine.refuse_forked()
         _refuse(options)
         super().reset(seed=seed)
         self._key = jax.random.key(self.np_random.integers(2**31))

@@ -388,7 +388,9 @@ def make_env(
     Raises:
         MapError, TaskError: a map is too small, or a task on it cannot be driven.
         ConfigError, CheckpointError: there is no such vehicle, or no such model.
+        UserError: this process was forked after JAX had started.
     """
+    machine.refuse_forked()
     driven = load_vehicle(vehicle) if isinstance(vehicle, str) else vehicle
     dynamics, params = load_model(model, weights, vehicle=driven, embeddings=config.embeddings)
     env = NavigationEnv(dynamics, config)
