@@ -62,14 +62,14 @@ bytes flipped             either   either   either   either   either   either   
 attitudes in degrees      refused  refused  -        -        -        -        -        -
 compass headings          refused  refused  refused  refused  refused  refused  refused  refused
 velocities of the world   refused  refused  refused  refused  refused  refused  refused  refused
-planar                    lifted!  lifted!  lifted!  lifted!  lifted!  lifted!  lifted!  lifted!
-x, y and yaw alone        lifted!  lifted!  lifted!  lifted!  lifted!  lifted!  lifted!  lifted!
-planar without a map      lifted!  lifted!  lifted!  lifted!  lifted!  lifted!  lifted!  lifted!
-3 mm on a small vehicle   read!    read!    read!    read!    read!    read!    read!    read!
+planar                    lifted   lifted   lifted   lifted   lifted   lifted   lifted   lifted
+x, y and yaw alone        lifted   lifted   lifted   lifted   lifted   lifted   lifted   lifted
+planar without a map      lifted   lifted   lifted   lifted   lifted   lifted   lifted   lifted
+3 mm on a small vehicle   read     read     read     read     read     read     read     read
 commands act late         told!    told!    told!    told!    told!    told!    told!    told!
-yaw rates                 read!    read!    read!    read!    read!    read!    read!    read!
-wheel speeds              read!    read!    -        -        -        -        -        -
-turns on the spot         cut!     cut!     cut!     cut!     cut!     cut!     cut!     cut!
+yaw rates                 read     read     read     read     read     read     read     read
+wheel speeds              read     read     -        -        -        -        -        -
+turns on the spot         cut      cut      cut      cut      cut      cut      cut      cut
 one bad log of four       told     told     told     told     told     told     told     told
 three bad logs of four    refused  refused  refused  refused  refused  refused  refused  refused
 one bad drive of four     told     told     -        -        -        -        -        -
@@ -128,7 +128,7 @@ def leap(samples: slice) -> Callable[[Logged], Logged]:
 
 
 def planar(seen: Logged) -> Logged:
-    level = Rotation.from_euler("Z", seen.state[:, 5])
+    level = Rotation.from_euler("ZYX", seen.state[:, 5:2:-1] * [1, 0, 0])
     moved = level.inv().apply(seen.rotation.apply(seen.state[:, 6:9])) * [1, 1, 0]
     found = with_(seen, np.s_[:, 6:9], state=moved)
     return replace(found, position=seen.position * [1, 1, 0], rotation=level)
@@ -276,8 +276,8 @@ DEFECTS = {
     "yaw rates": Defect(settings=YAW_RATES, yaw_rates=True),
     "wheel speeds": Defect(
         settings=both(
-            of_tables(speed=None, steering=None, left="left", right="right"),
             of_vehicle(steered="skid"),
+            of_tables(speed=None, steering=None, left="left", right="right"),
         ),
         yaw_rates=True,
     ),
@@ -382,13 +382,17 @@ def expected_states(seen: Logged, word: str, on_plane: bool) -> np.ndarray:
     fine = states(np.arange(START - 0.1, START + SECONDS + 0.1, 0.002))
     if word != "lifted":
         return fine
+    before = fine.copy()
     rise = np.zeros(2) if on_plane else np.array(SLOPE)
     up = np.append(-rise, 1) / np.linalg.norm(np.append(-rise, 1))
     fine[:, 2] = fine[:, :2] @ rise + RADIUS / up[2]
     ahead = np.cos(fine[:, 5]) * rise[0] + np.sin(fine[:, 5]) * rise[1]
     aside = -np.sin(fine[:, 5]) * rise[0] + np.cos(fine[:, 5]) * rise[1]
     fine[:, 4] = -np.arctan(ahead)
+    moved = Rotation.from_euler("ZYX", before[:, 5:2:-1]).apply(fine[:, 6:9])
+    moved[:, 2] = moved[:, :2] @ rise
     fine[:, 3] = np.arctan(aside * np.cos(fine[:, 4]))
+    fine[:, 6:9] = Rotation.from_euler("ZYX", fine[:, 5:2:-1]).inv().apply(moved)
     return fine
 
 

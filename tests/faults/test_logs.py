@@ -13,7 +13,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.spatial.transform import Rotation
 
 from vertiwm_jax import config
-from vertiwm_jax.importers import rosbag
+from vertiwm_jax.importers import commands
 from vertiwm_jax.importers.settings import Resampling, Table, Topics
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.terrain import files
@@ -205,7 +205,7 @@ def test_attitudes_of_another_unit_or_frame_are_refused(folder, tmp_path, case):
 
 @pytest.mark.parametrize("speed", [0.001, -0.001])
 def test_a_vehicle_that_hardly_moves_does_not_tell_its_steering(speed):
-    angles = rosbag.steering(np.array([2.0, speed]), np.array([0.5, 0.5]), wheelbase=2.0)
+    angles = commands.steering(np.array([2.0, speed]), np.array([0.5, 0.5]), wheelbase=2.0)
     assert np.abs(angles).max() < 0.8  # No car steers farther.
 
 

@@ -12,6 +12,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.importers import rosbag
+from vertiwm_jax.importers.commands import steering
 from vertiwm_jax.importers.settings import ImportSettings, Topics, Units
 from vertiwm_jax.learning.schema import DataError
 
@@ -73,7 +74,7 @@ def test_a_small_vehicle_steers_as_far_at_full_size(bag):
 def test_wheels_stay_as_they_were_where_a_twist_stands():
     speed, turn = np.array([0, 2, 0, 0, -2.0]), np.array([1, 0.5, 0.7, 0, 0.5])
     angle = np.arctan(0.5)
-    np.testing.assert_allclose(rosbag.steering(speed, turn, 2.0), [0, angle, angle, angle, -angle])
+    np.testing.assert_allclose(steering(speed, turn, 2.0), [0, angle, angle, angle, -angle])
 
 
 def test_stamped_twists(seen, tmp_path):
@@ -120,11 +121,12 @@ def test_bags_that_cannot_be_used_are_named(bag, seen, tmp_path):
 
     other = replace(ACKERMANN, rosbag=replace(TOPICS, odometry="/pose"))
     assert message(bag, other) == (
-        "/pose: expected messages of nav_msgs/msg/Odometry, found none; there is "
-        "/cmd, /cmd_vel, /odom"
+        "/pose: expected messages of nav_msgs/msg/Odometry or "
+        "geometry_msgs/msg/PoseWithCovarianceStamped or geometry_msgs/msg/PoseStamped, found none; "
+        "there is /cmd, /cmd_vel, /odom"
     )
     other = replace(ACKERMANN, rosbag=replace(TOPICS, odometry="/cmd_vel"))
-    assert message(bag, other).endswith("Odometry, found geometry_msgs/msg/Twist")
+    assert message(bag, other).endswith("PoseStamped, found geometry_msgs/msg/Twist")
     assert "a section `rosbag`" in message(bag, ImportSettings(VEHICLE))
     broken = tmp_path / "broken.bag"
     broken.write_bytes(b"#ROSBAG V2.0\nno more")

@@ -166,7 +166,7 @@ def test_files_that_cannot_be_read_are_named(seen, tmp_path):
 
 def test_attitudes_are_told_once():
     for attitudes in ({}, {"rpy": ("a", "b", "c"), "quaternion": ("a", "b", "c", "d")}):
-        with pytest.raises(ValueError, match="rpy, quaternion: expected one of them"):
+        with pytest.raises(ValueError, match="rpy, quaternion, yaw: expected one of"):
             Table("t", ("x", "y", "z"), "speed", "steer", **attitudes)
 
 

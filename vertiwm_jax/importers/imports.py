@@ -12,10 +12,10 @@ import numpy as np
 from vertiwm_jax import atomic, froude
 from vertiwm_jax import config as configuration
 from vertiwm_jax.evaluation.tables import Row, markdown
-from vertiwm_jax.importers import grid_map, resampling, rosbag, table
+from vertiwm_jax.importers import grid_map, planar, resampling, rosbag, table
 from vertiwm_jax.importers.log import Log
 from vertiwm_jax.importers.resampling import Drive
-from vertiwm_jax.importers.settings import ImportSettings
+from vertiwm_jax.importers.settings import GridMapSettings, ImportSettings
 from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.dataset import SplitConfig
 from vertiwm_jax.learning.schema import DataError
@@ -36,6 +36,8 @@ READERS: dict[str, Reader] = {
 """Formats of logs, by how their names end."""
 LARGEST_ANGLE = np.radians(20)
 """Between velocity and motion, in the median: another frame, or w before x, lie beyond."""
+LARGEST_SLIP = {"front": LARGEST_ANGLE, "skid": np.radians(30)}
+"""The same between motion and the x axis; a skid-steered Warthog drifts by 17 degrees."""
 
 
 def import_drives(
@@ -63,12 +65,8 @@ def import_drives(
     """
     settings = configuration.load(ImportSettings, settings_file)
     logs = dict(log for source in sources for log in _logs(source))
-    if map is None and (settings.rosbag is None or settings.rosbag.grid_map is None):
-        raise DataError(
-            f"{settings_file}: expected ground: give `--map MAP.npz`, which terrain.files.save "
-            "writes (docs/own-map.md), or name a bag's GridMap topic in rosbag.grid_map"
-        )
     ground = None if map is None else _ground(map, settings)
+    wanted = None if settings.rosbag is None else settings.rosbag.grid_map
     refused = dict[Path, str]()
     with atomic.new_folder(output) as unfinished:
         read = dict[Path, list[Log]]()
@@ -76,13 +74,24 @@ def import_drives(
             for path, reader in logs.items():
                 with _leaving_out(path, refused, len(logs)):
                     read[path] = reader(path, settings)
+                flat = all(planar.is_planar(log) for log in read.get(path, ()))
+                if ground is None and wanted is None and not flat:
+                    raise DataError(
+                        f"{settings_file}: expected ground: give `--map MAP.npz`, which "
+                        "terrain.files.save writes (docs/own-map.md), or name a bag's GridMap "
+                        "topic in rosbag.grid_map"
+                    )
                 progress.advance(1, path.name)
         remarks = [remark for path in read for log in read[path] for remark in log.remarks]
-        terrain = _ground_of_bags(list(read), settings, remarks) if ground is None else ground
+        if ground is None and wanted is not None:
+            ground = _ground_of_bags(list(read), wanted, settings, remarks)
+        if ground is None:
+            ground = planar.plane([log for path in read for log in read[path]], settings.plane)
+            remarks.append(f"there is no map: the ground is a plane of {settings.plane}")
         drives, rows = list[Drive](), dict[Path, Row]()
         for path in read:
             with _leaving_out(path, refused, len(logs)):
-                found, rows[path] = _import(path, read[path], settings, terrain, remarks)
+                found, rows[path] = _import(path, read[path], settings, ground, remarks)
                 drives += found
         if not drives:
             reasons = "; ".join(str(row["left out"]) for row in rows.values())
@@ -90,12 +99,12 @@ def import_drives(
                 f"{sources[0]}: expected a drive or more that can be used, found none: {reasons}"
             )
         (unfinished / "maps").mkdir()
-        files.save(terrain, unfinished / "maps" / "map.npz")
+        files.save(ground, unfinished / "maps" / "map.npz")
         meta = {"sources": [str(path) for path in logs], "map": "map.npz"}
         wheels = settings.vehicle.wheels_in_body_xy
-        placed = schema.in_file(_arrays(drives), terrain.offset())
+        placed = schema.in_file(_arrays(drives), ground.offset())
         schema.write(unfinished / "drives.npz", placed, meta, wheels)
-    remarks += [*refused.values(), *_remarks(drives, terrain, settings.vehicle.scale)]
+    remarks += [*refused.values(), *_remarks(drives, ground, settings.vehicle.scale)]
     none = dict.fromkeys(next(iter(rows.values())), "-") | {"left out": "all"}
     table = [rows.get(path, none | {"log": str(path)}) for path in logs]
     return "\n".join([markdown(table), "", *remarks])
@@ -141,11 +150,10 @@ def _ground(map: Path, settings: ImportSettings) -> TerrainMap:
 
 
 def _ground_of_bags(
-    paths: Sequence[Path], settings: ImportSettings, remarks: list[str]
+    paths: Sequence[Path], wanted: GridMapSettings, settings: ImportSettings, remarks: list[str]
 ) -> TerrainMap:
-    assert settings.rosbag is not None and settings.rosbag.grid_map is not None
     said = dict[str, int]()
-    terrain, unknown = grid_map.terrain(paths, settings.rosbag.grid_map, settings.frames, said)
+    terrain, unknown = grid_map.terrain(paths, wanted, settings.frames, said)
     remarks += [
         *said,
         f"{unknown:.0%} of the map had no height, and took that of the nearest cell",
@@ -164,17 +172,26 @@ def _import(
 
     Raises `DataError` unless most of its logs are of the schema, and move where they say.
     """
-    scale = settings.vehicle.scale
+    vehicle, scale = settings.vehicle, settings.vehicle.scale
     drives, left_out, refused = list[Drive](), Counter[str](), list[str]()
-    point = scale * np.asarray(settings.vehicle.logged_point)
+    point = scale * np.asarray(vehicle.logged_point)
     offset = np.append(terrain.offset(), 0)
     low, high = map(np.asarray, terrain.extent)
+    logs = [replace(log, position=log.position - offset) for log in logs]
+    flat = [planar.is_planar(log) for log in logs]
+    if any(flat):
+        said = f"{path}: z, roll and pitch never change in {sum(flat)} of {len(logs)} drives"
+        if vehicle.wheel_radius is None and all(log.position[:, 2].any() for log in logs):
+            remarks.append(f"{said}: vehicle.wheel_radius in the settings sets them on the ground")
+        else:
+            remarks.append(f"{said}: they are set on the ground")
+            pairs = zip(logs, flat, strict=True)
+            logs = [planar.lifted(log, terrain, settings) if level else log for log, level in pairs]
     for log in logs:
-        log = replace(log, position=log.position - offset)
         found, others = resampling.resample(log, settings.resampling, point)
         try:
             if found:
-                schema.check(log.name, _arrays(found))
+                schema.check_values(log.name, _arrays(found))
         except DataError as error:
             refused.append(str(error))
             continue
@@ -193,6 +210,7 @@ def _import(
         raise DataError(refused[0])
     remarks += refused
     if drives:
+        schema.check_travel(path, _arrays(drives))
         way_off, axis_off = resampling.directions(drives)
         if way_off > LARGEST_ANGLE:
             raise DataError(
@@ -200,7 +218,7 @@ def _import(
                 f"{np.degrees(way_off):.0f} degrees off in half of the steps; see `frames` of the "
                 "settings, and the order of quaternions"
             )
-        if logs[0].velocity is None and axis_off > LARGEST_ANGLE:
+        if logs[0].velocity is None and axis_off > LARGEST_SLIP[vehicle.steered]:
             raise DataError(
                 f"{path}: attitude: expected a vehicle that moves along its x axis, found "
                 f"{np.degrees(axis_off):.0f} degrees off in half of the steps; see `units.angle` "

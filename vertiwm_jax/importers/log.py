@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from vertiwm_jax.importers import commands
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.learning.schema import DataError
 
@@ -23,7 +24,8 @@ class Log:
 
     time: `[N]` s, increasing; position: `[N, 3]` p_world, m; attitude: of body to world, `[N, 3]`
     roll, pitch, yaw, rad, or `[N, 4]` quaternions x, y, z, w; command_time: `[M]` s, increasing;
-    command: `[M, 2]` speed and front-wheel angle, m/s and rad; velocity: `[N, 3]` v_body, m/s, and
+    command: `[M, 2]` speed and front-wheel angle, m/s and rad, NaN where a vehicle was told to turn
+    on the spot; kind: what a reader gives instead; velocity: `[N, 3]` v_body, m/s, and
     angular_velocity: `[N, 3]` omega_body, rad/s, None where they were not logged; name: of the
     file, and of the drive in it; remarks: what was found and left out of the file, and how many
     samples.
@@ -36,6 +38,7 @@ class Log:
     command: np.ndarray
     velocity: np.ndarray | None = None
     angular_velocity: np.ndarray | None = None
+    kind: commands.Kind = "steering"
     name: str = ""
     remarks: dict[str, int] = field(default_factory=dict)
 
@@ -106,12 +109,14 @@ def _in_si(log: Log, settings: ImportSettings) -> Log:
         turned = axes * unit * logged
         return turned if frame == "body" else rotation.inv().apply(turned)
 
+    turn = units.speed if log.kind == "wheels" else units.steering
+    commanded = commands.of_bicycle(log.command * [units.speed, turn], log.kind, settings.vehicle)
     return Log(
         time=second * units.time * log.time,
         position=meter * (axes * units.position * log.position - np.asarray(frames.origin)),
         attitude=attitude,
         command_time=second * units.time * log.command_time,
-        command=log.command * [meter / second * units.speed, units.steering],
+        command=commanded * [meter / second, 1],
         velocity=in_body(log.velocity, units.velocity * meter / second, frames.velocity),
         angular_velocity=in_body(
             log.angular_velocity, units.angle / second, frames.angular_velocity

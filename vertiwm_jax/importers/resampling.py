@@ -16,6 +16,10 @@ _TOLERANCE = 1e-6
 """s; stamps since 1970 are no finer in double precision than 2.4e-7 s."""
 _FASTEST, _NEAR = 50.0, 1.0
 """m/s and m; positions that are farther apart than either allows leap."""
+_HALF_BASE = 2
+"""Steps before and after a moment between which the way is measured that its velocity points."""
+_ROUGH, _WIDEST = 0.05, 1.5
+"""m/s that noise of positions may add to a velocity, and s that a window becomes for it at most."""
 _EACH_SIDE = 3
 """Poses before and after a moment that a parabola is fitted to, however few its window holds."""
 
@@ -51,12 +55,12 @@ def resample(
     leaps = moved > _NEAR + _FASTEST * np.diff(log.time)
     if leaps.any():
         left_out["cut at a leap of the position"] += log.time[1:][leaps].tolist()
+    commanded = list(_commanded(log, settings.command_gap, left_out))
     for poses in _runs(log.time, settings.gap, leaps):
         part = log.part(poses)
         last = part.time[-1]
-        for commands in _runs(log.command_time, settings.command_gap):
-            start = max(part.time[0], log.command_time[commands][0])
-            end = min(last, log.command_time[commands][-1] + settings.command_gap)
+        for first, until in commanded:
+            start, end = max(part.time[0], first), min(last, until)
             if end < start:
                 continue
             steps = int((end - start + _TOLERANCE) / STEP_SECONDS)
@@ -73,12 +77,13 @@ def resample(
 def directions(drives: Sequence[Drive]) -> tuple[float, float]:
     """Median angles, rad, over the steps at 1 m/s or more; NaN if there are none.
 
-    The first is between the velocity and the displacement of the step, the second between the
-    velocity and the body's x axis.
+    The first is between the velocity and the way from shortly before to shortly after, the second
+    between the velocity and the body's x axis.
     """
-    state = np.concatenate([drive.state[:-1] for drive in drives])
-    moved = np.concatenate([np.diff(drive.state[:, :3], axis=0) for drive in drives])
-    moving = np.linalg.norm(state[:, 6:9], axis=1) > 1
+    before, after = slice(None, -2 * _HALF_BASE), slice(2 * _HALF_BASE, None)
+    state = np.concatenate([drive.state[_HALF_BASE:-_HALF_BASE] for drive in drives])
+    moved = np.concatenate([drive.state[after, :3] - drive.state[before, :3] for drive in drives])
+    moving = (np.linalg.norm(state[:, 6:9], axis=1) > 1) & moved.any(axis=1)
     if not moving.any():
         return np.nan, np.nan
     velocity, attitude = state[moving, 6:9], Rotation.from_euler("ZYX", state[moving, 5:2:-1])
@@ -96,6 +101,17 @@ def _runs(stamps: np.ndarray, gap: float, cut: np.ndarray | bool = False) -> Ite
         yield slice(first, end)
 
 
+def _commanded(log: Log, gap: float, left_out: LeftOut) -> Iterator[tuple[float, float]]:
+    """When commands that can be held begin, and until when they hold."""
+    time, held = log.command_time, np.isfinite(log.command[:, 1])
+    for run in _runs(time, gap, held[1:] != held[:-1]):
+        first, until = time[run][0], time[run][-1] + gap
+        if held[run.start]:
+            yield first, min(until, time[run.stop]) if run.stop < len(time) else until
+        else:
+            left_out["turns on the spot"].append(first)
+
+
 def _state(log: Log, at: np.ndarray, window: float, logged_point: np.ndarray) -> np.ndarray:
     """`[T + 1, 12]` states at `[T + 1]` moments, from poses without a gap."""
     attitude = Slerp(log.time, log.rotation)(at)
@@ -106,7 +122,7 @@ def _state(log: Log, at: np.ndarray, window: float, logged_point: np.ndarray) ->
     velocity = None if log.velocity is None else between(log.velocity)
     omega = None if log.angular_velocity is None else between(log.angular_velocity)
     if velocity is None or omega is None:
-        fitted = _slopes(log, at, attitude, window)
+        fitted = _slopes(log, at, attitude, max(window, _quiet(log)))
         velocity = attitude.inv().apply(fitted[:, :3]) if velocity is None else velocity
         omega = fitted[:, 3:] if omega is None else omega
     return np.concatenate(
@@ -118,6 +134,21 @@ def _state(log: Log, at: np.ndarray, window: float, logged_point: np.ndarray) ->
         ],
         axis=1,
     )
+
+
+def _quiet(log: Log) -> float:
+    """s over which a parabola has to be fitted for slopes that noise makes no rougher than allowed.
+
+    Noise shows in how far a position is from the line between its neighbors.
+    """
+    time, position = log.time, log.position
+    if len(time) < 3:
+        return 0.0
+    apart = time[2:] - time[:-2]
+    share = ((time[1:-1] - time[:-2]) / apart)[:, None]
+    off = position[1:-1] - (1 - share) * position[:-2] - share * position[2:]
+    noise = np.median(np.abs(off) / (0.6745 * np.sqrt(1 + share**2 + (1 - share) ** 2)))
+    return float(min((6 * np.median(apart) * (noise / _ROUGH) ** 2) ** (1 / 3), _WIDEST))
 
 
 def _slopes(log: Log, at: np.ndarray, attitude: Rotation, window: float) -> np.ndarray:

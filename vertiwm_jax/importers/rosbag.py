@@ -3,7 +3,6 @@
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,11 +14,13 @@ from vertiwm_jax.importers.log import Log, converted
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.learning.schema import DataError
 
-_ODOMETRY = ("nav_msgs/msg/Odometry",)
+_POSES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/PoseStamped",
+)
 _ACKERMANN = ("ackermann_msgs/msg/AckermannDriveStamped", "ackermann_msgs/msg/AckermannDrive")
 _TWIST = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
-_SLOWEST = 0.05  # m/s at full size
-_FARTHEST = np.radians(45)
 _ZSTD = bytes.fromhex("28b52ffd")
 _MEND = "`rosbag reindex`, `ros2 bag reindex` or `mcap recover` mend what was cut off"
 
@@ -60,14 +61,15 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
         raise DataError(f"{path}: expected settings with a section `rosbag` that names its topics")
     by_header, said = names.stamps == "header", dict[str, int]()
     poses = [
-        (_stamp(received, message, by_header), *_odometry(message))
-        for received, message in messages(path, names.odometry, _ODOMETRY, said)
+        (_stamp(received, message, by_header), *_pose(message))
+        for received, message in messages(path, names.odometry, _POSES, said)
     ]
     commands = [
         (_stamp(received, message, by_header), *_command(message))
         for received, message in messages(path, names.command, (*_ACKERMANN, *_TWIST), said)
     ]
-    time, position, attitude, velocity, omega = (np.array(x) for x in zip(*poses, strict=True))
+    time, position, attitude, *velocities = (np.array(x) for x in zip(*poses, strict=True))
+    velocity, omega = velocities or (None, None)
     command_time, speed, turn, is_twist = (np.array(x) for x in zip(*commands, strict=True))
     found = Log(
         time=time,
@@ -77,30 +79,9 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
         angular_velocity=omega,
         command_time=command_time,
         command=np.stack([speed, turn], axis=1),
+        kind=names.twist if is_twist[0] else "steering",
     )
-    logs = converted(found, path, settings, said.items())
-    if not (is_twist[0] and names.twist == "yaw_rate"):
-        return logs
-    # At full size the wheelbase is `scale` times as long; the yaw rate is still the vehicle's.
-    wheelbase = settings.vehicle.wheelbase * settings.vehicle.scale**0.5
-    angles = [steering(log.command[:, 0], log.command[:, 1], wheelbase) for log in logs]
-    return [
-        replace(log, command=np.stack([log.command[:, 0], angle], axis=1))
-        for log, angle in zip(logs, angles, strict=True)
-    ]
-
-
-def steering(speed: np.ndarray, yaw_rate: np.ndarray, wheelbase: float) -> np.ndarray:
-    """`[M]` m/s and rad/s to the `[M]` front-wheel angles, rad, that turn so without slip.
-
-    No wheel turns beyond `_FARTHEST`. At next to no speed a yaw rate gives no angle: the wheels
-    keep theirs, and are straight at first.
-    """
-    moving = np.abs(speed) >= _SLOWEST
-    angle = np.arctan(wheelbase * yaw_rate / np.where(moving, speed, 1))
-    angle = np.clip(angle, -_FARTHEST, _FARTHEST)
-    latest = np.maximum.accumulate(np.where(moving, np.arange(len(speed)), -1))
-    return np.where(latest >= 0, angle[latest], 0)
+    return converted(found, path, settings, said.items())
 
 
 def messages(
@@ -193,11 +174,15 @@ def _stamp(received: int, message: Any, by_header: bool) -> float:
     return 1e-9 * received
 
 
-def _odometry(message: Any) -> tuple[list[float], ...]:
-    """Position, quaternion, linear and angular velocity."""
-    pose, twist = message.pose.pose, message.twist.twist
+def _pose(message: Any) -> tuple[list[float], ...]:
+    """Position, quaternion, and in odometry linear and angular velocity."""
+    pose = getattr(message.pose, "pose", message.pose)
     q = pose.orientation
-    return (_xyz(pose.position), [q.x, q.y, q.z, q.w], _xyz(twist.linear), _xyz(twist.angular))
+    found = _xyz(pose.position), [q.x, q.y, q.z, q.w]
+    if not hasattr(message, "twist"):
+        return found
+    twist = message.twist.twist
+    return (*found, _xyz(twist.linear), _xyz(twist.angular))
 
 
 def _command(message: Any) -> tuple[float, float, bool]:

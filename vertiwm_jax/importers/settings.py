@@ -3,11 +3,14 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from vertiwm_jax.config import Bounds, Positive, choices, settings
+from vertiwm_jax.config import Bounds, Positive, settings
 from vertiwm_jax.terrain.classes import STANDARD
 
 Triple = tuple[float, float, float]
 Names = tuple[str, str, str]
+GroundName = Annotated[
+    str, Bounds(f"one of {', '.join(STANDARD.names)}", lambda name: name in STANDARD.names)
+]
 
 
 @settings
@@ -21,6 +24,12 @@ class VehicleSettings:
     logged_point: Triple = (0.0, 0.0, 0.0)
     """The point whose position is logged, in the body frame of this project (x forward, y left,
     z up, from the point between the four wheel centers), m."""
+    wheel_radius: Positive | None = None
+    """m; needed to set logs of x, y and yaw alone on the ground."""
+    steered: Literal["front", "skid"] = "front"
+    """By wheels that turn, or by different speeds of the wheels of both sides. Yaw rates that no
+    front wheel can follow are followed as far as it turns; those of a skid-steered vehicle that
+    turns on the spot end a drive."""
     scale: Positive = 1.0
     """The factor from the vehicle to full size, as in its file: 10 for a 1/10-scale rover. Drives
     and map are enlarged by it, times and speeds by its square root, before `resampling`."""
@@ -48,7 +57,8 @@ class Units:
     velocity: _Factor = 1.0
     """m/s, of logged velocities."""
     speed: _Factor = 1.0
-    """m/s, of commanded speeds. Where a throttle was logged: the speed at a throttle of 1."""
+    """m/s, of commanded speeds. Where a throttle was logged: the speed at a throttle of 1. Where
+    wheel speeds were logged in rad/s: the radius of a wheel, m."""
     steering: _Factor = 1.0
     """rad of the front wheels, rad/s of commanded yaw rates; negative where right is positive."""
 
@@ -77,7 +87,8 @@ class Resampling:
     command_gap: Positive = 0.5
     """The same for commands. A command is held for up to this time."""
     window: Positive = 0.5
-    """s over which a parabola is fitted to poses, where velocities are not logged."""
+    """s over which a parabola is fitted to poses, where velocities are not logged; more, up to 1.5,
+    where noise of the positions would make them rougher than 0.05 m/s."""
     shortest: int = 32
     """Drives of fewer steps are left out; a window of `fit` has 32."""
     longest: int = 250
@@ -97,16 +108,25 @@ class Table:
 
     time: str
     """Time stamp of the row."""
-    position: Names
-    """x, y, z."""
-    speed: str
+    position: Names | tuple[str, str]
+    """x, y, z; or x, y, with `yaw`."""
+    speed: str | None = None
     """Commanded speed, or throttle."""
-    steering: str
-    """Commanded angle of the front wheels."""
+    steering: str | None = None
+    """Commanded angle of the front wheels. Give this or `yaw_rate`, or instead of both and the
+    speed `left` and `right`."""
+    yaw_rate: str | None = None
+    """Commanded yaw rate, left positive."""
+    left: str | None = None
+    """Commanded speed of the wheels on the left of a skid-steered vehicle."""
+    right: str | None = None
+    """The same on the right."""
     rpy: Names | None = None
-    """Roll, pitch and yaw, R = Rz Ry Rx. Give this or `quaternion`."""
+    """Roll, pitch and yaw, R = Rz Ry Rx. Give this, `quaternion` or `yaw`."""
     quaternion: tuple[str, str, str, str] | None = None
-    """x, y, z, w. Give this or `rpy`."""
+    """x, y, z, w."""
+    yaw: str | None = None
+    """Where a log has x, y and yaw alone: height, roll and pitch are those of the ground."""
     velocity: Names | None = None
     """Estimated from the positions by default."""
     angular_velocity: Names | None = None
@@ -117,8 +137,19 @@ class Table:
     """Column whose value differs between drives; by default a file is one drive."""
 
     def check(self):
-        if (self.rpy is None) == (self.quaternion is None):
-            raise ValueError("rpy, quaternion: expected one of them")
+        given = {name for name, value in vars(self).items() if value is not None}
+        if len(given & {"rpy", "quaternion", "yaw"}) != 1:
+            raise ValueError("rpy, quaternion, yaw: expected one of them")
+        if ("yaw" in given) != (len(self.position) == 2):
+            raise ValueError("position: expected x, y and z, or x and y with `yaw`")
+        commands = given & {"speed", "steering", "yaw_rate", "left", "right"}
+        if commands not in ({"speed", "steering"}, {"speed", "yaw_rate"}, {"left", "right"}):
+            raise ValueError(
+                "speed, steering: expected columns of speed and steering, speed and yaw_rate, or "
+                f"left and right; found {', '.join(sorted(commands)) or 'none'}"
+            )
+        if "brake" in given and "left" in given:
+            raise ValueError("brake: expected a column of speed to subtract it from, found none")
 
 
 @settings
@@ -131,13 +162,8 @@ class GridMapSettings:
     """Layer of heights, m."""
     semantic: str | None = None
     """Layer of class ids; by default all ground is of one class."""
-    ground: str = "grass"
+    ground: GroundName = "grass"
     """Ground class where there is no such layer, or where it has no value."""
-
-    def check(self):
-        if self.ground not in STANDARD.names:
-            expected = choices(self.ground, STANDARD.names)
-            raise ValueError(f"ground: expected {expected}, found {self.ground}")
 
 
 @dataclass(frozen=True)
@@ -145,7 +171,7 @@ class Topics:
     """Topics of a ROS bag."""
 
     odometry: str
-    """nav_msgs/Odometry."""
+    """nav_msgs/Odometry, or geometry_msgs/PoseStamped with or without a covariance."""
     command: str
     """ackermann_msgs/AckermannDrive or geometry_msgs/Twist, either with or without a stamp."""
     twist: Literal["yaw_rate", "steering"] = "yaw_rate"
@@ -156,7 +182,7 @@ class Topics:
     """Builds the map from the bag, unless a map is given."""
 
 
-@dataclass(frozen=True)
+@settings
 class ImportSettings:
     """The settings file of `import_drives`."""
 
@@ -168,3 +194,12 @@ class ImportSettings:
     """Columns of CSV and Parquet files."""
     rosbag: Topics | None = None
     """Topics of ROS bags."""
+    plane: GroundName = "grass"
+    """Ground class of the plane on which logs of x, y and yaw alone are set without a map."""
+
+    def check(self):
+        if self.table is not None and self.table.left and self.vehicle.steered != "skid":
+            raise ValueError(
+                "vehicle.steered: expected skid, as table.left and table.right name wheel speeds, "
+                f"found {self.vehicle.steered}"
+            )

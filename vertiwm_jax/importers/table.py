@@ -98,17 +98,31 @@ def _log(name: str, columns: Columns, table: Table) -> Log:
     def stacked(names: Sequence[str]) -> np.ndarray:
         return np.stack([numbers[key] for key in names], axis=1)
 
-    speed = numbers[table.speed]
+    time = numbers[table.time]
+    level = np.zeros((len(time), 2))
+    position = stacked(table.position)
+    if table.yaw:
+        position = np.column_stack([position, level[:, 0]])
+        attitude = np.column_stack([level, numbers[table.yaw]])
+    else:
+        attitude = stacked(table.quaternion or table.rpy or ())
+    if table.left and table.right:
+        kind, first, second = "wheels", table.left, table.right
+    else:
+        kind = "yaw_rate" if table.yaw_rate else "steering"
+        first, second = table.speed or "", table.steering or table.yaw_rate or ""
+    command = stacked([first, second])
     if table.brake is not None:
-        speed = speed - numbers[table.brake]
+        command[:, 0] -= numbers[table.brake]
     return Log(
-        time=numbers[table.time],
-        position=stacked(table.position),
-        attitude=stacked(table.quaternion or table.rpy or ()),
+        time=time,
+        position=position,
+        attitude=attitude,
         velocity=stacked(table.velocity) if table.velocity else None,
         angular_velocity=stacked(table.angular_velocity) if table.angular_velocity else None,
-        command_time=numbers[table.time],
-        command=np.stack([speed, numbers[table.steering]], axis=1),
+        command_time=time,
+        command=command,
+        kind=kind,
     )
 
 

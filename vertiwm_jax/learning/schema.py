@@ -76,6 +76,8 @@ _LIMITS = (
 _FLOATS = tuple(dict.fromkeys(name for name, *_ in _LIMITS))
 _MOVING = 1.0
 """Speed, m/s, above which the distance of a step is compared with it."""
+_BASE = 5
+"""Steps over which that distance is measured: noise of positions counts less over more."""
 _TRAVEL = (0.6, 1.6)
 """Bounds of that ratio: another sampling rate, km/h or centimeters lie beyond."""
 
@@ -209,13 +211,22 @@ def find_map(path: Path, name: str) -> Path:
 
 
 def check(
-    path: str | Path, arrays: dict[str, np.ndarray], offset: np.ndarray = np.zeros(2)
+    path: Path, arrays: dict[str, np.ndarray], offset: np.ndarray = np.zeros(2)
 ) -> dict[str, np.ndarray]:
     """Arrays of the schema, numbers in float32; raises `DataError`, which names `path`.
 
     They have to be of the right shape, finite where they are valid, and in SI units. offset:
     `TerrainMap.offset` of their map, which is taken off the positions.
     """
+    arrays = check_values(path, arrays, offset)
+    check_travel(path, arrays)
+    return arrays
+
+
+def check_values(
+    path: str | Path, arrays: dict[str, np.ndarray], offset: np.ndarray = np.zeros(2)
+) -> dict[str, np.ndarray]:
+    """As `check`, but whether positions move with the velocities is left aside."""
     if arrays["control"].ndim != 3:
         found = list(arrays["control"].shape)
         raise DataError(f"{path}: control: expected shape [K, T, 2], found {found}")
@@ -257,17 +268,25 @@ def check(
                     f"{path}: {name}: expected finite {meaning} within {limit:.4g}, "
                     f"found {values[bad][0]:.4g} among {bad.sum()} such values"
                 )
+    return arrays
+
+
+def check_travel(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Raises `DataError` unless the positions of most drives move as fast as their velocities."""
     state = arrays["state"]
+    base = min(_BASE, state.shape[1] - 1)
     speed = np.linalg.norm(state[:, :-1, 6:9], axis=-1)
-    moving = valid[:, 1:] & (speed > _MOVING)
-    travel = np.linalg.norm(np.diff(state[..., :3], axis=1), axis=-1)[moving]
-    ratio = np.median(travel / (speed[moving] * STEP_SECONDS)) if moving.any() else 1.0
+    speed = np.lib.stride_tricks.sliding_window_view(speed, base, axis=1).mean(axis=-1)
+    valid = np.arange(base, state.shape[1]) <= arrays["length"][:, None]
+    moving = valid & (speed > _MOVING)
+    travel = np.linalg.norm(state[:, base:, :3] - state[:, :-base, :3], axis=-1)[moving]
+    seconds = base * STEP_SECONDS
+    ratio = np.median(travel / (speed[moving] * seconds)) if moving.any() else 1.0
     if not _TRAVEL[0] < ratio < _TRAVEL[1]:
         raise DataError(
             f"{path}: state: expected positions in m that move with the velocity in m/s, one step "
             f"in {STEP_SECONDS:g} s; found steps {ratio:.3g} times as long"
         )
-    return arrays
 
 
 def _parse(path: Path, text: str, classes_known: bool) -> dict[str, Any]:
