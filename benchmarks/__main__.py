@@ -11,6 +11,7 @@ from typing import Any
 
 import benchmarks
 from benchmarks._harness import cell
+from vertiwm_jax import atomic
 
 _APART = {"gpu", "recurrent_baseline", "soil_adaptation", "turns"}
 """Those that need a GPU or a folder of drives; and what runs another one."""
@@ -40,6 +41,7 @@ def main() -> None:
     arguments = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     arguments.add_argument("--output", type=Path, default=Path("benchmarks.md"))
     chosen = arguments.parse_args()
+    atomic.expect_file(chosen.output)
     modules = pkgutil.iter_modules(benchmarks.__path__)
     names = [module.name for module in modules if not module.ispkg]
     found = {}

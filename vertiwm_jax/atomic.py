@@ -14,6 +14,31 @@ class WriteError(UserError):
     """A file or folder that cannot be written; the message names the path."""
 
 
+def expect_folder(folder: str | Path) -> None:
+    """Raises `WriteError` unless files can be written to a folder, which need not be there yet.
+
+    For commands, before they compute what they will write.
+    """
+    place = Path(folder).absolute()
+    while not os.path.lexists(place):
+        place = place.parent
+    try:
+        with tempfile.TemporaryFile(dir=place):
+            pass
+    except OSError as error:
+        raise WriteError(f"{folder}: cannot write there: {error.strerror}: {place}") from error
+
+
+def expect_file(path: str | Path) -> None:
+    """Raises `WriteError` unless a file can be written, or replaced, in a folder that is there."""
+    path = Path(path)
+    if path.is_dir():
+        raise WriteError(f"{path}: expected a file to write, found a folder")
+    if not path.parent.is_dir():
+        raise WriteError(f"{path}: expected a folder {path.parent} to write to, found none")
+    expect_folder(path.parent)
+
+
 def write(path: str | Path, data: bytes | str) -> None:
     """Replace the file at `path` by `data` as a whole, or not at all.
 

@@ -15,6 +15,7 @@ import rich.progress
 from rich.console import Console
 
 from vertiwm_jax import atomic, config, hosts, trackers
+from vertiwm_jax.atomic import WriteError
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.trackers import Events
 
@@ -71,6 +72,19 @@ class Run:
         if project and hosts.is_first():
             self._tracker = trackers.begin(project, folder, self.outermost, settings)
 
+    @staticmethod
+    def expect(settings: Any, project: str | None = None) -> None:
+        """Raises as `begin` where no run can begin or go on; for before what takes long."""
+        if project:
+            trackers.check(project)
+        if hosts.is_first():
+            try:
+                atomic.expect_folder(settings.resume or settings.runs)
+            except WriteError as error:
+                action = "go on with" if settings.resume else "start"
+                folder = settings.resume or settings.runs
+                raise RunError(f"{folder}: cannot {action} a run there: {error}") from error
+
     @classmethod
     def create(cls, root: str | Path, name: str, settings: Any, project: str | None = None) -> Self:
         """Begins a run in a new folder `root/name-YYYYmmdd-HHMMSS`; raises as `Run`."""
@@ -92,9 +106,8 @@ class Run:
         continue, or None. Raises as `Run`, before a folder is made if the package `wandb` is
         missing.
         """
+        cls.expect(settings, project)
         kept = dataclasses.replace(settings, resume=None)
-        if project:
-            trackers.check(project)
         if settings.resume is None:
             return cls.create(hosts.own(settings.runs), name, kept, project)
         return cls(hosts.own_copy(settings.resume), kept, step, project)

@@ -9,14 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from doors import door, refusal
-from faults.border import fault
 from learning import recordings
 
+from vertiwm_jax import config
+from vertiwm_jax.cli import view
 from vertiwm_jax.env.navigation import make_env
-from vertiwm_jax.evaluation import calibration, prediction, prediction_report, report
-from vertiwm_jax.learning import dataset
+from vertiwm_jax.evaluation import calibration, compare, prediction, prediction_report, report
+from vertiwm_jax.importers import imports
+from vertiwm_jax.learning import dataset, identification
 from vertiwm_jax.learning import experiment as fitting
 from vertiwm_jax.rl import experiment
+from vertiwm_jax.simulators import collection
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain.map import MapError, TerrainMap
 
@@ -110,7 +113,6 @@ def test_a_split_without_drives_is_refused_before_models_are_read(tmp_path, monk
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "td3"])
 @pytest.mark.parametrize("name", ["file", "file/runs"])
-@fault(Begun, "that no run folder can be made is told when vehicles have been placed")
 def test_an_unwritable_run_folder_is_refused_first(tmp_path, monkeypatch, algorithm, name):
     (tmp_path / "file").touch()
     monkeypatch.setattr(experiment, "training_ground", begin)
@@ -119,7 +121,6 @@ def test_an_unwritable_run_folder_is_refused_first(tmp_path, monkeypatch, algori
 
 
 @pytest.mark.parametrize("command", ["navigation", "prediction", "calibration"])
-@fault(Begun, "that tables cannot be written is told when all has been computed")
 def test_an_unwritable_output_is_refused_first(tmp_path, monkeypatch, command):
     (tmp_path / "file").touch()
     recordings.write(tmp_path, **recordings.drives())
@@ -184,3 +185,99 @@ def forked(tmp_path_factory):
 @pytest.mark.parametrize("command", ["collect", "evaluate"])
 def test_a_forked_process_says_that_it_cannot_go_on(forked, command):
     assert forked[command] and "spawn" in forked[command] and "\n" not in forked[command]
+
+
+def test_identify_without_drives_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        door("identify")(["--output", str(tmp_path / "mine.yaml")])
+    assert stop.value.code == 2
+    assert "drives: expected at least one, found none" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["file/mine.yaml", "none/mine.yaml", "."])
+def test_identify_refuses_first_what_it_cannot_write(tmp_path, monkeypatch, name):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(identification, "identify", begin)
+    message = refusal(door("identify"), tmp_path, "--output", tmp_path / name)
+    assert str(tmp_path / name) in message
+
+
+def test_collect_refuses_first_what_it_cannot_write(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(collection, "_terrain", begin)
+    message = refusal(door("collect"), "--output", tmp_path / "file" / "drives")
+    assert message.startswith(f"error: {tmp_path / 'file' / 'drives'}: cannot write there")
+
+
+@pytest.mark.parametrize("kind", ["maps", "drives"])
+def test_view_refuses_first_what_it_cannot_write(tmp_path, monkeypatch, kind):
+    (tmp_path / "file").touch()
+    recordings.write(tmp_path)
+    monkeypatch.setattr(view, "_scene", begin)
+    monkeypatch.setattr(view.maps, "draw", begin)
+    source = {"maps": tmp_path / "maps", "drives": tmp_path / "a.npz"}[kind]
+    output = tmp_path / "file" / "shown.rrd"
+    message = refusal(door("view"), source, "--output", output)
+    assert message.startswith(f"error: {output}: expected a folder {tmp_path / 'file'} to write to")
+
+
+def test_view_of_nothing_is_refused(tmp_path):
+    message = refusal(door("view"), tmp_path / "none")
+    assert message == (
+        f"error: {tmp_path / 'none'}: expected maps, a run or a file of drives, found none"
+    )
+
+
+def test_an_unwritable_file_of_errors_is_refused_first(tmp_path, monkeypatch):
+    recordings.write(tmp_path)
+    monkeypatch.setattr(prediction, "predict", begin)
+    file = tmp_path / "none" / "errors.json"
+    message = refusal(door("evaluate"), "prediction", "--data", tmp_path, "--json", file)
+    assert message.startswith(f"error: {file}: expected a folder")
+
+
+def test_a_misspelt_planner_is_refused_with_what_there_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    message = refusal(door("evaluate"), "navigation", "--policy", "mpi")
+    assert message == (
+        "error: policy: expected the folder of a run or one of straight, random, mppi, shooting; "
+        "did you mean 'mppi'?, found mpi"
+    )
+
+
+@pytest.mark.parametrize("name", ["ppo", "compare"])
+def test_missing_weights_are_told_before_worlds_are_drawn(tmp_path, monkeypatch, name):
+    monkeypatch.setattr(experiment, "training_ground", begin)
+    monkeypatch.setattr(compare.Run, "begin", begin)
+    weights = tmp_path / "none"
+    argv = ["--weights", weights, "--runs", tmp_path / "runs"]
+    if name == "compare":
+        for kind in ("ppo", "sac", "td3"):
+            shipped = config.default_config(kind).read_text(encoding="utf-8")
+            (tmp_path / f"{kind}.yaml").write_text(f"{shipped}\nweights: {weights}\n")
+        argv = ["--settings", tmp_path, "--runs", tmp_path / "runs"]
+    assert str(weights) in refusal(door(name), *argv)
+
+
+@pytest.mark.parametrize("ending", [".bag", ".parquet"])
+def test_a_missing_extra_is_told_before_logs_are_read(tmp_path, monkeypatch, ending):
+    (tmp_path / "a.csv").touch()
+    (tmp_path / f"b{ending}").touch()
+    settings = tmp_path / "settings.yaml"
+    settings.write_text("vehicle: {wheelbase: 2, track: 1}\n")
+    monkeypatch.setattr(imports.table, "read", begin)
+    monkeypatch.setitem(imports.READERS, ".csv", begin)
+    for package in ("rosbags", "pyarrow"):
+        monkeypatch.setitem(sys.modules, package, None)
+    message = refusal(
+        door("import_drives"),
+        *[tmp_path / "a.csv", tmp_path / f"b{ending}", "--output", tmp_path / "drives"],
+        *["--settings", settings, "--map", tmp_path / "map.npz"],
+    )
+    assert 'pip install "vertiwm-jax[logs]"' in message and f"b{ending}: " in message
+
+
+def test_settings_of_another_collection_are_told_before_worlds_are_drawn(tmp_path, monkeypatch):
+    monkeypatch.setattr(collection, "_terrain", begin)
+    (tmp_path / "other.txt").touch()
+    assert "expected a new folder" in refusal(door("collect"), "--output", tmp_path)

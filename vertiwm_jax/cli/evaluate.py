@@ -4,6 +4,7 @@ from typing import Annotated
 
 import tyro
 
+from vertiwm_jax import atomic
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.evaluation.calibration import CalibrationTest
 from vertiwm_jax.evaluation.floor import FloorTest
@@ -21,4 +22,8 @@ Test = (
 def run(name: str, words: list[str]) -> None:
     off = (tyro.conf.FlagConversionOff,)
     test = arguments.read(Test, name, words, description=__doc__, config=off)
+    if test.output:
+        atomic.expect_folder(test.output)
+    if isinstance(test, PredictionTest) and test.json:
+        atomic.expect_file(test.json)
     print(f"\n{test.run()}")

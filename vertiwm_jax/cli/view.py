@@ -7,6 +7,7 @@ from pathlib import Path
 
 import tyro
 
+from vertiwm_jax import atomic
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import ConfigError, CountOrZero, settings
 from vertiwm_jax.env.suites import Suite
@@ -56,10 +57,17 @@ class View:
 
 def run(name: str, words: list[str]) -> None:
     command = arguments.read(View, name, words)
-    if maps.are_maps(command.source):
-        print(f"the picture is {maps.draw(command.source, command.output)}")
+    source = command.source
+    if not source.exists():
+        raise ConfigError(f"{source}: expected maps, a run or a file of drives, found none")
+    of_maps = maps.are_maps(source)
+    beside = maps.beside(source) if of_maps else _beside(command)
+    path = command.movie or command.output or beside
+    atomic.expect_file(path)
+    if of_maps:
+        maps.draw(source, path)
+        print(f"the picture is {path}")
         return
-    path = command.movie or command.output or _beside(command)
     write = movie.write
     if not command.movie:
         with needs("rerun-sdk", "view", path):

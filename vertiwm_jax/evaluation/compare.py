@@ -81,6 +81,7 @@ def compare(config: CompareConfig) -> str:
     Returns their table as Markdown, which the run folder keeps beside tables and pictures of each
     simulator.
     """
+    Run.expect(config)
     keep_compiled(config.compile_cache)
     settings = {row: training(config, row) for row in config.rows}
     vehicles = {chosen.vehicle for chosen in settings.values()}
@@ -90,6 +91,8 @@ def compare(config: CompareConfig) -> str:
     first = settings[config.rows[0]]
     for simulator in config.simulators:
         external.expect(simulator, first)
+    for row in config.rows:
+        experiment.dynamics(settings[row], row.model)  # That it cannot be read is to be said now.
     ground = GroundConfig(
         suites=config.suites, suite_worlds=config.suite_worlds, pairs=config.pairs
     )

@@ -14,7 +14,7 @@ import numpy as np
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import figures, machine, runs
-from vertiwm_jax.config import Count, settings
+from vertiwm_jax.config import ConfigError, Count, settings
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.episodes import NavigationResult, run_episodes
@@ -102,17 +102,13 @@ class NavigationTest:
     def run(self) -> str:
         """Runs the test and writes what `output` asks for; returns the tables as Markdown."""
         run = self.policy if isinstance(self.policy, Path) else None
+        if run and not run.is_dir():
+            known = configuration.choices(str(run), ("straight", "random", "mppi", "shooting"))
+            raise ConfigError(f"policy: expected the folder of a run or {known}, found {run}")
         file = run / "config.yaml" if run else configuration.default_config("ppo")
         trained = experiment.load(file)
         config = self.changed(trained)
         external.expect(self.simulator, config)
-        if self.terrain:
-            scale = config.driven.scale
-            terrain = files.load_map(
-                self.terrain, scale=scale, obstacles=self.obstacles, least=SMALLEST
-            )
-        else:
-            terrain = experiment.held_out(config)
         policies = dict(config.baselines)
         if run:
             # It plans as it was trained, also where it knows less of the map.
@@ -122,6 +118,13 @@ class NavigationTest:
             policies = {REFERENCE: policies[REFERENCE]}
         elif self.policy != "random":
             policies = {str(self.policy): self._planner(config)} | policies
+        if self.terrain:
+            scale = config.driven.scale
+            terrain = files.load_map(
+                self.terrain, scale=scale, obstacles=self.obstacles, least=SMALLEST
+            )
+        else:
+            terrain = experiment.held_out(config)
         groups = drive(config, terrain, policies, config.world_suites, self.simulator, self.jobs)
         if self.output:
             write(self.output, groups, terrain, config.navigation.goal_radius)

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import numpy as np
 
 from vertiwm_jax import atomic, froude
 from vertiwm_jax import config as configuration
+from vertiwm_jax.errors import needs
 from vertiwm_jax.evaluation.tables import Row, markdown
 from vertiwm_jax.importers import grid_map, planar, resampling, rosbag, table
 from vertiwm_jax.importers.log import Log
@@ -65,10 +67,16 @@ def import_drives(
     """
     settings = configuration.load(ImportSettings, settings_file)
     logs = dict(log for source in sources for log in _logs(source))
-    ground = None if map is None else _ground(map, settings)
     wanted = None if settings.rosbag is None else settings.rosbag.grid_map
+    for path, reader in logs.items():
+        packages = ["rosbags"] * (reader is rosbag.read)
+        packages += ["pyarrow"] * (path.suffix in (".parquet", ".zstd"))
+        for package in packages:
+            with needs(package, "logs", path):
+                import_module(package)
     refused = dict[Path, str]()
     with atomic.new_folder(output) as unfinished:
+        ground = None if map is None else _ground(map, settings)
         read = dict[Path, list[Log]]()
         with Progress(len(logs), "logs") as progress:
             for path, reader in logs.items():

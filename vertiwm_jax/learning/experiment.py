@@ -46,6 +46,7 @@ def run(config: FitConfig) -> Path:
     Tells by logging what it does. Raises `UserError` where settings, drives, an earlier run or the
     disk do not allow it, and `TrainingInterrupted` at Ctrl-C once all is saved.
     """
+    Run.expect(config, config.wandb)
     keep_compiled(config.compile_cache)
     start = _start(config)
     for collection in pipeline.expect_drives(config):

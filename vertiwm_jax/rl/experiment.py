@@ -289,15 +289,16 @@ def run(
     Tells by logging what it does. Raises `UserError` where settings, maps, tasks, an earlier run or
     the disk do not allow it, and `TrainingInterrupted` at Ctrl-C once all is saved.
     """
+    Run.expect(config, config.wandb)
     keep_compiled(config.compile_cache)
     # So that it goes on as it began, and is tested, from wherever that is.
     paths = {name: getattr(config, name) for name in ("terrain", "weights")}
     absolute = {name: path and path.absolute() for name, path in paths.items()}
     config = replace(config, compute_dtype=config.fixed_dtype, **absolute)
+    moves, weights = dynamics(config, config.model)
     _log.info("drawing worlds ...")
     terrain, pool, held_out = training_ground(config, worlds)
     machine.forget_programs()
-    moves, weights = dynamics(config, config.model)
     env = NavigationEnv(moves, config.navigation, config.variation)
     given = weights, terrain, pool, config.driven.vehicle, encoders(config)
     shapes = env.make_params(*given, settled=False)

@@ -104,8 +104,10 @@ def collect(config: CollectConfig) -> None:
     """Records what the folder lacks, a world after the other."""
     if config.simulator == "chrono":
         chrono.modules()
+    _expect(config)
     driven = vehicle.load(config.vehicle)
-    terrain, learned = _terrain(config, driven.scale), _learned(config, driven)
+    learned = _learned(config, driven)
+    terrain = _terrain(config, driven.scale)
     _claim(config)
     paths = [config.output / f"world_{world:03d}.npz" for world in range(terrain.worlds)]
     missing = [world for world, path in enumerate(paths) if not path.exists()]
@@ -199,15 +201,26 @@ def _learned(config: CollectConfig, driven: VehicleConfig) -> Learned | None:
     return acting, policy.task, seen_by
 
 
+def _as_kept(config: CollectConfig) -> tuple[Path, CollectConfig]:
+    """What notes what a folder is made by, and what it notes."""
+    return config.output / "config.yaml", replace(config, output=Path("."), jobs=1)
+
+
 def _claim(config: CollectConfig) -> None:
-    """Notes in the folder what it is made by; `ConfigError` if it was made by something else."""
-    file = config.output / "config.yaml"
-    asked = replace(config, output=Path("."), jobs=1)
+    """Notes in the folder what it is made by."""
+    file, asked = _as_kept(config)
+    (config.output / "maps").mkdir(parents=True, exist_ok=True)
+    atomic.write(file, configuration.dump(asked))
+
+
+def _expect(config: CollectConfig) -> None:
+    """Raises `WriteError`, or `ConfigError` if the folder was made by something else."""
+    atomic.expect_folder(config.output)
+    file, asked = _as_kept(config)
     if not file.exists():
         if config.output.is_dir() and any(config.output.iterdir()):
             raise ConfigError(f"{file}: expected a new folder, or one of this command")
-        (config.output / "maps").mkdir(parents=True, exist_ok=True)
-        atomic.write(file, configuration.dump(asked))
+        return
     before = configuration.load(CollectConfig, file)
     for name, found in vars(asked).items():
         was = getattr(before, name)

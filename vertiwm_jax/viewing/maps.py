@@ -18,9 +18,12 @@ def are_maps(source: Path) -> bool:
         return "elevation.npy" in file.namelist() and "state.npy" not in file.namelist()
 
 
-def draw(source: Path, path: Path | None = None) -> Path:
-    """Draws a map, or all maps of a folder. Returns the file, by default beside them."""
-    path = path or (source / "maps.png" if source.is_dir() else source.with_suffix(".png"))
+def beside(source: Path) -> Path:
+    """Where the picture of maps is, unless another file is asked for."""
+    return source / "maps.png" if source.is_dir() else source.with_suffix(".png")
+
+
+def draw(source: Path, path: Path) -> None:
+    """Draws a map, or all maps of a folder, into a file."""
     files = sorted(source.glob("*.npz")) if source.is_dir() else [source]
     figures.save(load_map(source).plot([file.stem for file in files] or None), path)
-    return path
