@@ -100,7 +100,7 @@ class Recurrent:
 def fitted(folders: list[Path], updates: int, runs: Path) -> tuple[Recurrent, RecurrentParams]:
     """From the training drives in `folders`; the run folder keeps its checkpoints."""
     training, validation = (
-        dataset.load_drives(folders, split) for split in ("train", "validation")
+        dataset.load_drives(folders, split, dataset.FITTED) for split in ("train", "validation")
     )
     config = FitConfig(updates=updates, weight_decay=0.05, trainable=("network",))
     windows = WindowConfig(context=8, weights=(1.0, 1.0, 2.0))

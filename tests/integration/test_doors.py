@@ -384,9 +384,10 @@ def test_bad_drives_are_named(tmp_path, capsys):
     predict = ("prediction", "--models", "builtin", "--data", tmp_path)
     assert "found none" in refusal(door("evaluate"), *predict)
     drives(tmp_path, count=25, steps=24, speed=4.0)
-    assert "at least 32 steps, found at most 24" in refusal(door("evaluate"), *predict)
-    drives(tmp_path, count=3, steps=24, speed=4.0)
-    assert "for the test split" in refusal(door("evaluate"), *predict)
+    message = refusal(door("evaluate"), *predict)
+    assert "at least 32 steps in the test split, found at most 24" in message
+    drives(tmp_path, count=2, steps=24, speed=4.0)
+    assert "too few to share out" in refusal(door("evaluate"), *predict)
     drives(tmp_path, count=25, steps=24, speed=4000.0)
     assert "drives.npz: state: expected" in refusal(door("evaluate"), *predict)
     (tmp_path / "maps" / "map_0.npz").unlink()

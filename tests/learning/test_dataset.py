@@ -8,12 +8,15 @@ import pytest
 from learning.recordings import GRASS, SNOW, STEPS, drives, wheel_signals, write
 
 from vertiwm_jax.config import ConfigError
-from vertiwm_jax.learning import dataset
+from vertiwm_jax.learning import dataset, pipeline
 from vertiwm_jax.learning.dataset import Collection, SplitConfig
+from vertiwm_jax.learning.pipeline import KINDS, PipelineConfig
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.map import MapError, TerrainMap
+
+OPEN = Path(__file__).parents[2] / "data" / "open"
 
 
 @pytest.mark.parametrize(
@@ -312,3 +315,62 @@ def test_vehicles_are_named_as_the_files_say(tmp_path):
         write(tmp_path, f"{i}.npz", meta=np.array(json.dumps(meta)))
     loaded, _ = dataset.load_drives(tmp_path, "test")
     assert loaded.vehicles == ("uaz", "HMMWV_Reduced", "unnamed", "unnamed")
+
+
+def test_worlds_that_are_left_out_are_only_to_test(tmp_path):
+    folder = tmp_path / "open" / "rigid"
+    folder.mkdir(parents=True)
+    for name in ("rigid_012", "other_012", "rigid_013"):
+        write(folder, f"{name}.npz", **drives(count=25))
+    splits = SplitConfig(leave_out=("rigid/rigid_012", "mixed/rigid_013", "igid_013", "012"))
+    collection = Collection.of(folder, splits)
+    counts = {
+        split: [len(collection.rows(path, split)) for path in collection.lengths]
+        for split in ("train", "validation", "test", "unseen", "all")
+    }
+    # In the order other_012, rigid_012, rigid_013: only whole names of files and folders count.
+    assert counts == {
+        "train": [20, 0, 20],
+        "validation": [2, 0, 2],
+        "test": [3, 3, 3],
+        "unseen": [0, 25, 0],
+        "all": [25, 25, 25],
+    }
+    assert "75 drives: 40 train, 4 validation, 9 test, 22 unseen" in str(collection)
+    loaded, terrain = dataset.load_drives(folder, "unseen", splits)
+    assert len(loaded.state) == 25 and terrain.worlds == 1
+    with pytest.raises(DataError, match="expected drives of the unseen split, found none"):
+        dataset.load_drives(folder, "unseen")
+
+
+@pytest.mark.integration
+def test_the_unseen_worlds_are_four_of_each_kind_from_low_to_high(monkeypatch):
+    monkeypatch.chdir(OPEN)  # However the folder is named, the worlds are found.
+    found = [Collection.of(kind, dataset.FITTED) for kind in KINDS]
+    names = [name for collection in found for name in collection.left_out.values()]
+    assert sorted(names) == sorted(dataset.UNSEEN)
+    for collection in found:
+        steep = []
+        for path in collection.left_out:
+            elevation = np.asarray(files.load_map(OPEN / "maps" / path.name).elevation[0])
+            steep.append(np.abs(np.gradient(elevation)).mean())
+            assert len(collection.rows(path, "train")) == 0
+        assert min(steep) < 0.08 < 0.1 < max(steep)
+        assert len(steep) == 4
+        assert "320 train" not in str(collection) and "240 train" in str(collection)
+
+
+def test_a_fit_leaves_the_unseen_worlds_out(tmp_path):
+    folder = tmp_path / "open" / "mixed"
+    folder.mkdir(parents=True)
+    for name in ("mixed_015", "mixed_017"):
+        write(folder, f"{name}.npz", **drives(count=25))
+    config = PipelineConfig(data=(folder.parent,))
+    (found,) = pipeline.expect_drives(config)
+    assert found.left_out == {folder / "mixed_015.npz": "open/mixed/mixed_015"}
+    for split, count in (("train", 20), ("validation", 2)):
+        loaded, terrain = pipeline._Pipeline(config, None, (), True).load(("mixed",), split)
+        assert len(loaded.state) == count and terrain.worlds == 1
+    misspelt = SplitConfig(leave_out=("mixed/mixed_17",))
+    with pytest.raises(DataError, match=r"leave_out: .* found mixed/mixed_17, which is not in"):
+        pipeline.expect_drives(PipelineConfig(data=(folder.parent,), splits=misspelt))

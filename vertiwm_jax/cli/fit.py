@@ -4,7 +4,7 @@ from vertiwm_jax import figures, runs
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.learning import experiment, pipeline
-from vertiwm_jax.learning.dataset import SplitConfig
+from vertiwm_jax.learning.dataset import FITTED
 from vertiwm_jax.learning.experiment import FitConfig
 
 ROLLOUTS = ("nesam_rollouts", "transformer_rollouts", "gate*")
@@ -27,5 +27,6 @@ def run(name: str, words: list[str]) -> None:
     print(f"the model is in {folder / 'model'}; how well it predicts:")
     data, splits = pipeline.folders(config, pipeline.KINDS)[0], config.splits
     shared = f" --splits.shares {' '.join(map(str, splits.shares))} --splits.whole {splits.whole}"
-    also = "" if splits == SplitConfig() else shared
+    shared += f" --splits.leave-out {' '.join(splits.leave_out)}"
+    also = "" if splits == FITTED else shared
     print(f"python -m vertiwm_jax.evaluate prediction --compare {folder} --data {data}{also}")

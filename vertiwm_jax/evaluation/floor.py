@@ -14,7 +14,7 @@ from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, settings
 from vertiwm_jax.evaluation import yardsticks
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.learning.dataset import Drives, WheelSignals
+from vertiwm_jax.learning.dataset import Drives, SplitConfig, WheelSignals
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle
@@ -49,6 +49,8 @@ class FloorTest:
     """Name of a shipped vehicle, or a YAML file of one."""
     split: dataset.Split = "test"
     """Which of the drives."""
+    splits: SplitConfig = dataset.FITTED
+    """How drives are shared out, and which worlds are left out of fits."""
     every: Count = 1
     """1 drives all of these, 2 every other one, and so on."""
     context: CountOrZero = 16
@@ -71,7 +73,7 @@ class FloorTest:
         if self.simulator == "chrono":
             chrono.modules()
         driven = vehicle.load(self.vehicle).vehicle
-        recorded, terrain = dataset.load_drives(self.data, self.split)
+        recorded, terrain = dataset.load_drives(self.data, self.split, self.splits)
         steps, rng = self.context + max(self.horizons), np.random.default_rng(self.seed)
         numbers = list(range(0, len(recorded.length), self.every))
         tasks = [_task(recorded, terrain, number, steps, rng) for number in numbers]

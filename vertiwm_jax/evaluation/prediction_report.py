@@ -56,9 +56,11 @@ class PredictionTest:
     compare: tuple[Path, ...] = ()
     """Run folders of `fit`, of which each part is a row."""
     split: dataset.Split | None = None
-    """Which of the drives; by default those to test, or all of too few to share out."""
-    splits: SplitConfig = SplitConfig()
-    """How drives are shared out whose files do not say what they are for."""
+    """Which of the drives; by default those to test, or all of too few to share out. `unseen` are
+    all of the worlds that are left out of fits."""
+    splits: SplitConfig = dataset.FITTED
+    """How drives are shared out whose files do not say what they are for, and which worlds are left
+    out of fits."""
     context: CountOrZero = 16
     """Recorded steps that a model sees first."""
     horizons: Annotated[tuple[Count, ...], AtLeastOne] = (16,)

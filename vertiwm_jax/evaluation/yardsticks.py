@@ -152,6 +152,7 @@ def table(found: Sequence[ErrorRow]) -> str:
                 "heading, rad": f"{row.heading_rad:.3f}",
                 "tilt, rad": f"{row.tilt_rad:.4f}",
                 "speed, m/s": f"{row.speed_m_s:.3f}",
+                "diverged": f"{row.diverged}",
             }
         )
     steps = found[0].horizon

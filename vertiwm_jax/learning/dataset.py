@@ -21,8 +21,24 @@ from vertiwm_jax.precision import float32
 from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain.map import TerrainMap, stack
 
-Split = Literal["train", "validation", "test", "all"]
-"""Which drives: those for one purpose, or all."""
+Split = Literal["train", "validation", "test", "unseen", "all"]
+"""Which drives: those for one purpose, all of the worlds that are left out, or all."""
+UNSEEN = (
+    "open/rigid/rigid_012",
+    "open/rigid/rigid_016",
+    "open/rigid/rigid_014",
+    "open/rigid/rigid_013",
+    "open/deformable/deformable_013",
+    "open/deformable/deformable_015",
+    "open/deformable/deformable_016",
+    "open/deformable/deformable_010",
+    "open/mixed/mixed_016",
+    "open/mixed/mixed_014",
+    "open/mixed/mixed_015",
+    "open/mixed/mixed_002",
+)
+"""Worlds of `data/open` that no fit learns from: of each kind the last with low relief, the last
+that is rolling, the last in between and the last with high relief."""
 _IN_A_ROW = 25
 """So neighbors, maybe pieces of one log, are mostly for the same; yet tests are from all of it."""
 
@@ -74,6 +90,9 @@ class SplitConfig:
     """Of drives to train, for validation and to test, of all files of a folder together."""
     whole: Literal["drives", "worlds"] = "drives"
     """What is never divided: drives, or all drives on the same map."""
+    leave_out: tuple[str, ...] = ()
+    """Worlds of which no drive is to train or for validation, whatever files say: ends of the paths
+    of their files, without `.npz`."""
 
     def check(self):
         if abs(sum(self.shares) - 1) > 1e-6:
@@ -100,12 +119,16 @@ class SplitConfig:
         return np.array(SPLITS)[order]
 
 
+FITTED = SplitConfig(leave_out=UNSEEN)
+"""How drives are shared out for fits, and for tests of what was fitted."""
+
+
 @dataclass(frozen=True)
 class Collection:
     """A folder of drives: how long they are, and what each is for.
 
     lengths, purposes: `[K]` by file. decided: by what. divided: False where the drives are too few
-    to share out; then all are to train.
+    to share out; then all are to train. left_out: by file, the name by which it is left out.
     """
 
     folder: Path
@@ -113,6 +136,7 @@ class Collection:
     purposes: dict[Path, np.ndarray]
     decided: str
     divided: bool
+    left_out: dict[Path, str]
 
     @classmethod
     def of(cls, folder: str | Path, splits: SplitConfig = SplitConfig()) -> Self:
@@ -138,11 +162,16 @@ class Collection:
         decided = ["as files say"] if said else []
         if units:
             decided.append(f"by share of {splits.whole}" if divided else "too few to share out")
-        return cls(Path(folder), lengths, said | given, ", ".join(decided), divided)
+        named = ((path, name) for path in found for name in splits.leave_out if _ends(path, name))
+        left_out, purposes = dict(named), said | given
+        for path in left_out:
+            purposes[path] = np.where(purposes[path] == "test", "test", "unseen")
+        return cls(Path(folder), lengths, purposes, ", ".join(decided), divided, left_out)
 
     def rows(self, path: Path, split: Split) -> np.ndarray:
         """Which drives of a file are of a split."""
-        return np.flatnonzero((self.purposes[path] == split) | (split == "all"))
+        every = split == "all" or (split == "unseen" and path in self.left_out)
+        return np.flatnonzero((self.purposes[path] == split) | every)
 
     def longest(self, split: Split) -> int:
         """Steps of the longest drive of a split; -1 if it has none."""
@@ -151,8 +180,15 @@ class Collection:
 
     def __str__(self) -> str:
         every = np.concatenate(list(self.purposes.values())).tolist()
-        counts = ", ".join(f"{every.count(purpose)} {purpose}" for purpose in SPLITS)
+        told = (*SPLITS, "unseen") if self.left_out else SPLITS
+        counts = ", ".join(f"{every.count(purpose)} {purpose}" for purpose in told)
         return f"{self.folder}: {len(every)} drives: {counts} ({self.decided})"
+
+
+def _ends(path: Path, name: str) -> bool:
+    """Whether the path of a file of drives ends with a name, which has no `.npz`."""
+    parts = Path(name).parts
+    return path.resolve().with_suffix("").parts[-len(parts) :] == parts
 
 
 def expect_drives(collections: Sequence[Collection], split: Split, steps: int = 0) -> None:
@@ -184,9 +220,10 @@ def load_drives(
 
     Args:
         folders: a folder of `.npz` files of drives, or several.
-        split: which drives of each folder: those to `train`, for `validation` or to `test`, or
-            `all`.
-        splits: how the drives of a folder are shared out whose files do not say it.
+        split: which drives of each folder: those to `train`, for `validation` or to `test`; all of
+            the worlds that are left out, `unseen`; or `all`.
+        splits: how the drives of a folder are shared out whose files do not say it, and which
+            worlds are left out.
 
     Returns:
         D drives at 10 Hz, of T steps at most: states `[D, T + 1, 12]` (position in m and roll,

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from vertiwm_jax import config as configuration
 from vertiwm_jax.geometry import wrap
 from vertiwm_jax.learning import windows
-from vertiwm_jax.learning.dataset import load_drives
+from vertiwm_jax.learning.dataset import FITTED, load_drives
 from vertiwm_jax.learning.objectives import open_loop
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics import vehicle as vehicles
@@ -61,7 +61,7 @@ def identify(
     """
     begin = vehicles.load(vehicle) if isinstance(vehicle, str) else vehicle
     configuration.expect_fields(free, VehicleConfig, where="free: ")
-    recorded, terrain = load_drives(drives, "train")
+    recorded, terrain = load_drives(drives, "train", FITTED)
     index = windows.index(recorded, terrain, _CONTEXT, horizon, horizon)
     every = -(-len(index.start) // _MOST_WINDOWS)
     chosen = windows.gather(recorded, index, np.arange(0, len(index.start), every))

@@ -85,8 +85,9 @@ class PipelineConfig:
     """Folders of more drives beside those, such as a policy has driven (`collect --policy`)."""
     reuse: tuple[Path, ...] = ()
     """Folders of earlier runs, whose stages are taken over where their inputs are the same."""
-    splits: SplitConfig = SplitConfig()
-    """How drives are shared out whose files do not say what they are for."""
+    splits: SplitConfig = dataset.FITTED
+    """How drives are shared out whose files do not say what they are for, and which worlds are left
+    out of the fit."""
     seed: int = 0
     """Decides everything that is random."""
     model: ModelConfig = ModelConfig()
@@ -131,7 +132,8 @@ class PipelineConfig:
 def expect_drives(config: PipelineConfig) -> list[Collection]:
     """The collections that all is fitted to.
 
-    Raises `DataError` unless each has drives to train and to validate on, and one is long enough.
+    Raises `DataError` unless each has drives to train and to validate on, and one is long enough,
+    and where a world that is to be left out is not there.
     """
     for name in config.model.parts:
         folders(config, getattr(config, name).learns_from)
@@ -139,6 +141,14 @@ def expect_drives(config: PipelineConfig) -> list[Collection]:
     splits: tuple[Split, ...] = ("train", "validation")
     for split in splits:
         dataset.expect_drives(found, split, config.windows.context + config.windows.horizon)
+    there = {name for collection in found for name in collection.left_out.values()}
+    for name in config.splits.leave_out:
+        if name not in there and name not in dataset.UNSEEN:
+            places = ", ".join(str(collection.folder) for collection in found)
+            raise DataError(
+                f"splits.leave_out: expected ends of paths of files of drives, without .npz, such "
+                f"as {dataset.UNSEEN[0]}, found {name}, which is not in {places}"
+            )
     return found
 
 
