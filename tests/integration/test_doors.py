@@ -388,6 +388,7 @@ def test_bad_drives_are_named(tmp_path, capsys):
     assert "at least 32 steps in the test split, found at most 24" in message
     drives(tmp_path, count=2, steps=24, speed=4.0)
     assert "too few to share out" in refusal(door("evaluate"), *predict)
+    predict += ("--context", "2", "--horizons", "4")
     drives(tmp_path, count=25, steps=24, speed=4000.0)
     assert "drives.npz: state: expected" in refusal(door("evaluate"), *predict)
     (tmp_path / "maps" / "map_0.npz").unlink()
