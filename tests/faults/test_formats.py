@@ -66,7 +66,7 @@ planar                    lifted   lifted   lifted   lifted   lifted   lifted   
 x, y and yaw alone        lifted   lifted   lifted   lifted   lifted   lifted   lifted   lifted
 planar without a map      lifted   lifted   lifted   lifted   lifted   lifted   lifted   lifted
 3 mm on a small vehicle   read     read     read     read     read     read     read     read
-commands act late         told!    told!    told!    told!    told!    told!    told!    told!
+commands act late         told     told     told     told     told     told     told     told
 yaw rates                 read     read     read     read     read     read     read     read
 wheel speeds              read     read     -        -        -        -        -        -
 turns on the spot         cut      cut      cut      cut      cut      cut      cut      cut
@@ -154,7 +154,7 @@ def obedient(seen: Logged) -> Logged:
     sudden = np.random.default_rng(2).uniform([1.5, -0.3], [3.5, 0.3], (99, 2))
 
     def told(time: np.ndarray) -> np.ndarray:
-        return sudden[((time - START) / 0.4).astype(int)]
+        return sudden[np.floor((time - START) / 0.4 + 1e-6).astype(int)]
 
     speed, angle = told(fine - 0.2).T
     turn = speed * np.tan(angle) / VEHICLE.wheelbase
@@ -272,7 +272,9 @@ DEFECTS = {
         error=0.15,
         pace=0.5,
     ),
-    "commands act late": Defect(obedient, words="commands act 0.2", error=np.inf),
+    "commands act late": Defect(
+        obedient, settings=ON_WHEELS, words="commands act 0.2", error=np.inf
+    ),
     "yaw rates": Defect(settings=YAW_RATES, yaw_rates=True),
     "wheel speeds": Defect(
         settings=both(

@@ -156,3 +156,11 @@ def test_settings_of_no_vehicle():
         Units(speed=0.0)
     left_front = ImportSettings(VehicleSettings(2.0, 1.2)).vehicle.wheels_in_body_xy[0]
     assert left_front == [1.0, 0.6]
+
+
+def test_commands_may_be_moved_later(arrays):
+    later = replace(SETTINGS.resampling, delay=0.25)
+    vehicle = replace(SETTINGS.vehicle, scale=4.0)
+    found = read(arrays, replace(SETTINGS, resampling=later, vehicle=vehicle))
+    # Times of the vehicle's own are half of those at full size.
+    np.testing.assert_allclose(found.command_time - found.time, 0.5)

@@ -14,7 +14,8 @@ from vertiwm_jax import atomic, froude
 from vertiwm_jax import config as configuration
 from vertiwm_jax.errors import needs
 from vertiwm_jax.evaluation.tables import Row, markdown
-from vertiwm_jax.importers import grid_map, planar, resampling, rosbag, table
+from vertiwm_jax.importers import delay, grid_map, planar, resampling, rosbag, table
+from vertiwm_jax.importers.delay import Delay, Response
 from vertiwm_jax.importers.log import Log
 from vertiwm_jax.importers.resampling import Drive
 from vertiwm_jax.importers.settings import GridMapSettings, ImportSettings
@@ -22,6 +23,7 @@ from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.dataset import SplitConfig
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.runs import Progress
+from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -96,11 +98,12 @@ def import_drives(
         if ground is None:
             ground = planar.plane([log for path in read for log in read[path]], settings.plane)
             remarks.append(f"there is no map: the ground is a plane of {settings.plane}")
-        drives, rows = list[Drive](), dict[Path, Row]()
+        drives, rows, delays = list[Drive](), dict[Path, Row](), list[Delay]()
         for path in read:
             with _leaving_out(path, refused, len(logs)):
-                found, rows[path] = _import(path, read[path], settings, ground, remarks)
+                found, rows[path], late = _import(path, read[path], settings, ground, remarks)
                 drives += found
+                delays += [] if late is None else [late]
         if not drives:
             reasons = "; ".join(str(row["left out"]) for row in rows.values())
             raise DataError(
@@ -113,6 +116,8 @@ def import_drives(
         placed = schema.in_file(_arrays(drives), ground.offset())
         schema.write(unfinished / "drives.npz", placed, meta, wheels)
     remarks += [*refused.values(), *_remarks(drives, ground, settings.vehicle.scale)]
+    if delays:
+        remarks.append(_lateness(delays, settings.vehicle.scale**0.5))
     none = dict.fromkeys(next(iter(rows.values())), "-") | {"left out": "all"}
     table = [rows.get(path, none | {"log": str(path)}) for path in logs]
     return "\n".join([markdown(table), "", *remarks])
@@ -175,13 +180,14 @@ def _import(
     settings: ImportSettings,
     terrain: TerrainMap,
     remarks: list[str],
-) -> tuple[list[Drive], Row]:
-    """The drives of a file that are on the map, and its row of the table.
+) -> tuple[list[Drive], Row, Delay | None]:
+    """The drives of a file that are on the map, its row of the table, and how late they obey.
 
     Raises `DataError` unless most of its logs are of the schema, and move where they say.
     """
     vehicle, scale = settings.vehicle, settings.vehicle.scale
     drives, left_out, refused = list[Drive](), Counter[str](), list[str]()
+    responses = list[Response]()
     point = scale * np.asarray(vehicle.logged_point)
     offset = np.append(terrain.offset(), 0)
     low, high = map(np.asarray, terrain.extent)
@@ -203,12 +209,13 @@ def _import(
         except DataError as error:
             refused.append(str(error))
             continue
-        for drive in found:
-            xy = drive.state[:, :2]
-            if ((xy >= low) & (xy <= high)).all():
-                drives.append(drive)
-            else:
-                others["off the map"].append(drive.start)
+        inside = [((xy.state[:, :2] >= low) & (xy.state[:, :2] <= high)).all() for xy in found]
+        kept = [drive for drive, stays in zip(found, inside, strict=True) if stays]
+        drives += kept
+        responses += _responses(log, kept)
+        gone = [drive.start for drive, stays in zip(found, inside, strict=True) if not stays]
+        if gone:
+            others["off the map"] += gone
         for why, moments in others.items():
             if why not in left_out:
                 first = min(moments) / (scale**0.5 * settings.units.time)
@@ -237,19 +244,52 @@ def _import(
     reasons = ", ".join(f"{count} {why}" for why, count in left_out.items() if count)
     apart = np.concatenate([np.diff(log.time) for log in logs])
     derived = {"velocity": logs[0].velocity, "angular velocity": logs[0].angular_velocity}
-    return drives, {
+    # Where velocities were logged, they are as they were measured.
+    window = settings.resampling.window if logs[0].velocity is None else 0.0
+    late = delay.estimate(responses, window) if responses else None
+    row = {
         "log": str(path),
         "poses a second": f"{scale**0.5 / np.median(apart):.1f}" if len(apart) else "-",
         "from poses": ", ".join(name for name, logged in derived.items() if logged is None) or "-",
         "drives": len(drives),
         "steps": f"{sum(len(drive.control) for drive in drives):,}",
+        "delay": "-" if late is None else f"{late.seconds / scale**0.5:.2f} s",
         "left out": reasons or "-",
     }
+    return drives, row, late
+
+
+def _responses(log: Log, drives: Sequence[Drive]) -> list[Response]:
+    """What the drives of a log tell of its commands; none of no drives."""
+    if not drives:
+        return []
+    times = [drive.start + STEP_SECONDS * np.arange(len(drive.state)) for drive in drives]
+    state = np.concatenate([drive.state for drive in drives])
+    time, speed, yaw_rate = np.concatenate(times), state[:, 6], state[:, 11]
+    return [Response(time, speed, yaw_rate, log.command_time, log.command)]
 
 
 def _arrays(drives: Sequence[Drive]) -> dict[str, np.ndarray]:
     """All drives as arrays of the schema."""
     return schema.join([schema.drive(drive.state, drive.control) for drive in drives])
+
+
+def _lateness(delays: Sequence[Delay], second: float) -> str:
+    """How late all logs obey, in the seconds of the vehicle itself."""
+    seconds, low, high = (
+        np.median([getattr(late, name) for late in delays]) / second
+        for name in ("seconds", "low", "high")
+    )
+    lags = zip(*(late.lags for late in delays), strict=True)
+    told = [
+        f"{what} with a lag of {np.median(some) / second:.2f} s"
+        for what, each in zip(("speeds", "yaw rates"), lags, strict=True)
+        if (some := [lag for lag in each if lag is not None])
+    ]
+    return (
+        f"commands act {seconds:.2f} s late (90 %: {low:.2f} to {high:.2f}), then "
+        f"{' and '.join(told)} follow; resampling.delay takes a delay off"
+    )
 
 
 def _remarks(drives: Sequence[Drive], terrain: TerrainMap, scale: float) -> list[str]:

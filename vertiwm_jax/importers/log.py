@@ -115,7 +115,7 @@ def _in_si(log: Log, settings: ImportSettings) -> Log:
         time=second * units.time * log.time,
         position=meter * (axes * units.position * log.position - np.asarray(frames.origin)),
         attitude=attitude,
-        command_time=second * units.time * log.command_time,
+        command_time=second * (units.time * log.command_time + settings.resampling.delay),
         command=commanded * [meter / second, 1],
         velocity=in_body(log.velocity, units.velocity * meter / second, frames.velocity),
         angular_velocity=in_body(

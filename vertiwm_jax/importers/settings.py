@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from vertiwm_jax.config import Bounds, Positive, settings
+from vertiwm_jax.config import Bounds, NotNegative, Positive, settings
 from vertiwm_jax.terrain.classes import STANDARD
 
 Triple = tuple[float, float, float]
@@ -89,6 +89,9 @@ class Resampling:
     window: Positive = 0.5
     """s over which a parabola is fitted to poses, where velocities are not logged; more, up to 1.5,
     where noise of the positions would make them rougher than 0.05 m/s."""
+    delay: NotNegative = 0.0
+    """s of the vehicle's own by which commands are moved later, because they act later or poses
+    have later stamps; the command tells how much there is."""
     shortest: int = 32
     """Drives of fewer steps are left out; a window of `fit` has 32."""
     longest: int = 250
