@@ -3,11 +3,13 @@
 import io
 import struct
 import sys
+import tracemalloc
 import zipfile
 import zlib
 
 import numpy as np
 import pytest
+import rasterio
 from faults.border import refusal
 from importers.bags import Bag
 
@@ -77,6 +79,33 @@ def npz(folder):
     return lambda: files.load_map(folder / "map.npz")
 
 
+def bomb(folder):
+    """A gibibyte of zeros in a few megabytes."""
+    files.save(TerrainMap.from_array(np.ones((9, 9))), folder / "good.npz")
+    options = {"compression": zipfile.ZIP_DEFLATED, "compresslevel": 1}
+    with (
+        zipfile.ZipFile(folder / "good.npz") as good,
+        zipfile.ZipFile(folder / "map.npz", "w", **options) as bad,
+    ):
+        for name in set(good.namelist()) - {"elevation.npy"}:
+            bad.writestr(name, good.read(name))
+        with bad.open("elevation.npy", "w", force_zip64=True) as stream:
+            stream.write(claiming((2**14, 2**14))[:-64])
+            for _ in range(64):
+                stream.write(bytes(2**24))
+    return lambda: files.load_map(folder / "map.npz")
+
+
+def tiff(folder):
+    transform = rasterio.Affine(1, 0, 500000, 0, -1, 5000000)
+    with rasterio.open(
+        folder / "heights.tif", "w", driver="GTiff", width=60000, height=60000, count=1,
+        dtype="float32", crs="EPSG:32632", transform=transform, sparse_ok=True,
+    ):  # fmt: skip
+        pass
+    return lambda: files.from_heightmap(folder / "heights.tif")
+
+
 def png(folder):
     def chunk(kind, data):
         return (
@@ -91,6 +120,15 @@ def png(folder):
 
 
 @pytest.mark.usefixtures("little_memory")
-@pytest.mark.parametrize("make", [npy, npz, png])
+@pytest.mark.parametrize("make", [npy, npz, bomb, tiff, png])
 def test_a_file_that_says_it_is_large_is_refused(tmp_path, make):
-    assert refusal(make(tmp_path), MapError).startswith(f"{tmp_path}")
+    read = make(tmp_path)
+    tracemalloc.start()
+    try:
+        message = refusal(read, MapError)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert message.startswith(f"{tmp_path}")
+    assert "expected at most" in message or "exceeds limit" in message
+    assert most < 2**24

@@ -39,6 +39,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vertiwm_jax import atomic
+from vertiwm_jax.arrays import load_archive
 from vertiwm_jax.errors import UserError, refusing
 from vertiwm_jax.state import STEP_SECONDS
 
@@ -124,8 +125,8 @@ def _stored(path: Path, names: Sequence[str], required: Sequence[str]) -> dict[s
     """The arrays of these names, as far as the file has them."""
     expected = f"{path}: expected an .npz archive of plain arrays"
     refused = refusing(lambda found: DataError(f"{expected}: {found}"))
-    with refused, np.load(path, allow_pickle=False) as archive:
-        found = {name: archive[name] for name in names if name in archive}
+    with refused:
+        found = load_archive(path, names)
     missing = [name for name in required if name not in found]
     if missing:
         raise DataError(f"{path}: missing {', '.join(missing)}; found {list(found)}")

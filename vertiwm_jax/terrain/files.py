@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -12,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from vertiwm_jax import atomic, froude
+from vertiwm_jax import arrays, atomic, froude
 from vertiwm_jax.errors import refusing
 from vertiwm_jax.precision import float32
 from vertiwm_jax.terrain import geotiff, query, soil, vertibench
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.geotiff import Raster
-from vertiwm_jax.terrain.map import MapError, TerrainMap, expect_room, stack
+from vertiwm_jax.terrain.map import MapError, TerrainMap, bounded, expect_room, stack
 from vertiwm_jax.terrain.soil import Soil
 
 # How Chrono calls our soil parameters, and how many of its units make one of ours.
@@ -31,6 +32,19 @@ _SOIL_FIELDS = {
     "Janosi_shear": ("shear_modulus", 1.0),
     "unit_weight": ("unit_weight", 1.0),
 }
+
+
+_ARRAYS = (
+    "elevation",
+    "patch_class",
+    "patch_friction",
+    "obstacles",
+    "origin",
+    "resolution",
+    "class_rgb",
+    "meta",
+)
+_IMAGES = ("PNG", "BMP", "GIF", "JPEG", "PPM")
 
 
 @float32
@@ -177,7 +191,10 @@ def _agreed(name: str, asked: float | None, told: float | None) -> float:
 def _load_world(path: Path) -> TerrainMap:
     name = str(path)
     refused = refusing(partial(MapError, name, "file", "an .npz map"))
-    with refused, np.load(path, allow_pickle=False) as file:
+    with refused:
+        file = arrays.load_archive(path, _ARRAYS)
+        if missing := [key for key in _ARRAYS if key not in file]:
+            raise KeyError(f"{missing[0]} is not a file in the archive")
         return TerrainMap.from_array(
             file["elevation"],
             file["patch_class"],
@@ -226,13 +243,14 @@ def _read_raster(path: Path, field: str, from_geotiff: Callable[[Path, str], Ras
     with refusing(partial(MapError, str(path), field, "a PNG, .npy or GeoTIFF file")):
         suffix = path.suffix.lower()
         if suffix == ".npy":
-            return Raster(np.load(path, allow_pickle=False))
+            return Raster(arrays.load(path))
         if suffix in (".tif", ".tiff"):
             return from_geotiff(path, field)
-        with Image.open(path) as image:
-            return Raster(
-                np.asarray(image.convert("RGB") if image.mode in ("P", "RGBA") else image)
-            )
+        # Pillow warns where a file is large or odd.
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=_IMAGES) as image:
+            bounded(str(path), field, (image.height, image.width))
+            colored = image.mode in ("P", "RGBA")
+            return Raster(np.asarray(image.convert("RGB") if colored else image))
 
 
 def _read_classes(path: Path, classes: GroundClasses, heights: Raster) -> np.ndarray:

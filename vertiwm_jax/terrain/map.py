@@ -1,6 +1,7 @@
 """The terrain map of one world, or of many stacked worlds."""
 
 import math
+import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -27,6 +28,7 @@ class MapError(UserError, ValueError):
 
     def __init__(self, name: str, field: str, expected: str, found: str, mend: str = "") -> None:
         ending = f"; {mend}" if mend else ""
+        found = textwrap.shorten(found, 300)  # Of arrays, not all, and in one line.
         super().__init__(f"{name}: {field}: expected {expected}, found {found}{ending}")
 
 
@@ -168,8 +170,8 @@ class TerrainMap:
         Raises:
             MapError: an array is malformed; the message names it.
         """
-        check = partial(_check, name)
-        heights = np.asarray(elevation, np.float32)
+        check, numbers = partial(_check, name), partial(_numbers, name)
+        heights = numbers("elevation", elevation, np.float32)
         expected = "a 2-D array of 2 x 2 vertices or more"
         shape = heights.shape
         check("elevation", len(shape) == 2 and min(shape) >= 2, expected, f"shape {shape}")
@@ -179,7 +181,7 @@ class TerrainMap:
         check("resolution", 0 < resolution < np.inf, "meters between vertices, > 0", resolution)
         height, width = (resolution * (n - 1) for n in shape)
         centered = np.array([-width / 2, height / 2], np.float32)
-        corner = np.asarray(centered if origin is None else origin, np.float64)
+        corner = numbers("origin", centered if origin is None else origin)
         # Coordinates on Earth are no larger.
         good = corner.shape == (2,) and (np.abs(corner) < 1e8).all()
         check("origin", good, "finite x, y in m", corner)
@@ -201,19 +203,21 @@ class TerrainMap:
         check("classes", 0.9 < tall < 1.1, expected, f"{tall:.2f} times as tall as wide", mend)
         colors = np.shape(ground.rgb)
         check("class_rgb", colors == (last + 1, 3), f"shape ({last + 1}, 3)", colors)
+        check("class_rgb", (ground.rgb >= 0) & (ground.rgb <= 255), "0 to 255", ground.rgb)
         wrong = soil.out_of_range(ground.stacked_soils())
         check("soils", not wrong, "soils in SI units", wrong)
 
         if friction is None:
             friction = ground.friction[semantic]
-        friction, soft = np.asarray(friction, np.float32), ground.deformable[semantic]
+        friction, soft = numbers("friction", friction, np.float32), ground.deformable[semantic]
         check("friction", friction.shape == soft.shape, f"shape {soft.shape}", friction.shape)
         good = soft | (friction > 0) & np.isfinite(friction)
         check("friction", good, "numbers > 0 on rigid ground", friction)
-        boxes = np.zeros((0, 5)) if obstacles is None else np.asarray(obstacles, np.float64)
+        boxes = numbers("obstacles", np.zeros((0, 5)) if obstacles is None else obstacles)
         check("obstacles", boxes.shape[1:] == (5,), "shape (any, 5)", boxes.shape)
         check("obstacles", np.isfinite(boxes), "finite numbers", boxes)
-        check("obstacles", boxes[:, 2:] >= 0, "sizes and heights >= 0", boxes[:, 2:])
+        good = (boxes[:, 2:] >= 0) & (boxes[:, 2:] < 1e4)
+        check("obstacles", good, "sizes and heights >= 0, less than 10 km", boxes[:, 2:])
         low, high = corner - [0, height], corner + [width, 0]
         unused = ~boxes.any(axis=1, keepdims=True)
         good = unused | (boxes[:, :2] >= low) & (boxes[:, :2] <= high)
@@ -326,6 +330,20 @@ def bounded(name: str, field: str, shape: Sequence[int]) -> None:
     if math.prod(shape) > MOST:
         found = " x ".join(map(str, shape))
         raise MapError(name, field, f"at most {MOST:,} numbers", found, "cut the map to a part")
+
+
+def _numbers(
+    name: str, field: str, values: ArrayLike, dtype: type[np.floating] = np.float64
+) -> np.ndarray:
+    """The values as floats, those that are too large as inf; `MapError` unless all are numbers."""
+    try:
+        found = np.asarray(values)
+    except ValueError as error:  # Lists of unequal length.
+        raise MapError(name, field, "an array", f"{error}") from None
+    if found.dtype.kind not in "biuf":
+        raise MapError(name, field, "numbers", f"dtype {found.dtype}")
+    with np.errstate(over="ignore"):
+        return found.astype(dtype)
 
 
 def _check(

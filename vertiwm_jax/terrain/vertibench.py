@@ -67,11 +67,12 @@ def _world(image: Path, path: Path) -> TerrainMap:
 
 def _gray(path: Path) -> np.ndarray:
     expected = "an 8-bit gray BMP"
-    with refusing(partial(MapError, str(path), "elevation", expected)), Image.open(path) as image:
-        gray = np.asarray(image.convert("L"), np.float32)
-    if gray.shape != (VERTICES, VERTICES):
-        raise MapError(str(path), "elevation", f"{VERTICES} x {VERTICES} pixels", f"{gray.shape}")
-    return gray
+    refused = refusing(partial(MapError, str(path), "elevation", expected))
+    with refused, Image.open(path, formats=["BMP"]) as image:
+        if image.size != (VERTICES, VERTICES):
+            expected = f"{VERTICES} x {VERTICES} pixels"
+            raise MapError(str(path), "elevation", expected, f"{image.size}")
+        return np.asarray(image.convert("L"), np.float32)
 
 
 def _patches(textures: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
@@ -79,10 +80,11 @@ def _patches(textures: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
     ids = {name: k for k, name in enumerate(STANDARD.names)}
     classes, friction = np.full((CELLS, CELLS), -1), np.zeros((CELLS, CELLS))
     for texture in textures:
-        index, kind = tuple(texture["index"]), texture["terrain_type"]
-        classes[index] = ids[kind]
+        row, column = (range(CELLS).index(i) for i in texture["index"])
+        kind = texture["terrain_type"]
+        classes[row, column] = ids[kind]
         if kind not in STANDARD.soils:
-            friction[index] = texture["friction"]
+            friction[row, column] = texture["friction"]
     return classes, friction
 
 
