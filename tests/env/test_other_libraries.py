@@ -42,7 +42,7 @@ def test_ppo_of_stable_baselines_learns(made, normalized):
         return float(np.mean(evaluate_policy(agent, env, n_eval_episodes=20)[0]))
 
     before = mean_return()
-    agent.learn(4096 if not normalized else 24_576)
+    agent.learn(4096 if not normalized else 8192)
     assert mean_return() > before + 2 * METER
 
 

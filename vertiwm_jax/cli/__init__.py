@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from types import ModuleType
 
 import jax
 
@@ -59,6 +60,8 @@ def prepare(name: str) -> None:
     machine.use_cores()
     # Tracing makes many lasting objects; looking for garbage among them is a sixth of its time.
     gc.set_threshold(100_000, 50, 50)
+    # gymnax imports it to draw Pong, which would be two seconds of every start.
+    sys.modules.setdefault("seaborn", ModuleType("seaborn"))
     jax.config.update("jax_enable_x64", False)
     hosts.join(name)
 
