@@ -11,6 +11,7 @@ _DELAYS = np.arange(0, 0.805, _GRID)
 _LAGS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.2)
 _EXPLAINED = 0.15
 """Share of a motion that commands have to explain, or they tell nothing of when they act."""
+_BEFORE = 5.0  # s in which a lag forgets
 _APART = 5  # samples that tell as much as one, as velocities are smooth
 _DROP = 1.35  # of the logarithm of the likelihood, at the ends of a 90 % interval
 _VAGUE = 0.25  # s
@@ -19,7 +20,7 @@ _MOST = 20_000
 
 @dataclass(frozen=True)
 class Response:
-    """A drive, and all commands of its log.
+    """A drive without gaps, and all commands of its log.
 
     time: `[T]` s; speed, yaw_rate: `[T]` m/s and rad/s; command_time: `[M]` s; command: `[M, 2]`
     speed and front-wheel angle, m/s and rad, each held until the next.
@@ -107,7 +108,7 @@ def _followed(response: Response, column: int, lag: float, window: float) -> np.
     """`[D, T]` the command as a first-order lag follows it, at each delay."""
     held, command = response.command_time, response.command[:, column]
     command = np.nan_to_num(np.tan(command) if column else command)
-    grid = np.arange(held[0], max(held[-1], response.time[-1]) + _GRID, _GRID)
+    grid = np.arange(response.time[0] - _BEFORE, response.time[-1] + _GRID, _GRID)
     told = command[np.maximum(np.searchsorted(held, grid + 1e-9, side="right") - 1, 0)]
     decay = np.exp(-_GRID / lag) if lag else 0.0
     told, _ = lfilter([1 - decay], [1, -decay], told, zi=[decay * told[0]])

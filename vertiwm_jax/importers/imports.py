@@ -212,7 +212,7 @@ def _import(
         inside = [((xy.state[:, :2] >= low) & (xy.state[:, :2] <= high)).all() for xy in found]
         kept = [drive for drive, stays in zip(found, inside, strict=True) if stays]
         drives += kept
-        responses += _responses(log, kept)
+        responses += [_response(log, drive) for drive in kept]
         gone = [drive.start for drive, stays in zip(found, inside, strict=True) if not stays]
         if gone:
             others["off the map"] += gone
@@ -259,14 +259,10 @@ def _import(
     return drives, row, late
 
 
-def _responses(log: Log, drives: Sequence[Drive]) -> list[Response]:
-    """What the drives of a log tell of its commands; none of no drives."""
-    if not drives:
-        return []
-    times = [drive.start + STEP_SECONDS * np.arange(len(drive.state)) for drive in drives]
-    state = np.concatenate([drive.state for drive in drives])
-    time, speed, yaw_rate = np.concatenate(times), state[:, 6], state[:, 11]
-    return [Response(time, speed, yaw_rate, log.command_time, log.command)]
+def _response(log: Log, drive: Drive) -> Response:
+    time = drive.start + STEP_SECONDS * np.arange(len(drive.state))
+    speed, yaw_rate = drive.state[:, 6], drive.state[:, 11]
+    return Response(time, speed, yaw_rate, log.command_time, log.command)
 
 
 def _arrays(drives: Sequence[Drive]) -> dict[str, np.ndarray]:
