@@ -31,7 +31,7 @@ def refuse_forked() -> None:
     global _process
     if os.getpid() == _process:
         return
-    devices = jax.config.read("jax_num_cpu_devices")
+    devices = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
     try:
         jax.config.update("jax_num_cpu_devices", devices + 1)
     except RuntimeError:  # It cannot be changed after JAX has started.
