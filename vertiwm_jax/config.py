@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import difflib
 import functools
+import math
 import re
 import types
 from collections.abc import Callable, Iterable, Iterator
@@ -33,6 +34,7 @@ from vertiwm_jax.errors import UserError
 T = TypeVar("T")
 
 _PACKAGE = Path(__file__).resolve().parent
+_LARGEST = 2**63 - 1  # that an array can hold
 _FOLDERS = (_PACKAGE / "configs", _PACKAGE.parent / "configs")
 
 
@@ -69,10 +71,10 @@ AtLeastOne = Bounds("at least one", bool, of_each=False)
 def settings(cls: type[T]) -> type[T]:
     """A frozen dataclass whose values are checked whenever one is made.
 
-    Values have to lie within the `Bounds` of their annotations. Then the method `check`, if there
-    is one, looks at what joins several fields, and raises `ValueError`. Values that are refused
-    raise `ConfigError`. A class variable `GONE` says of keys of earlier versions what became of
-    them, for files that still have them.
+    Values have to be numbers that arrays can hold, within the `Bounds` of their annotations. Then
+    the method `check`, if there is one, looks at what joins several fields, and raises
+    `ValueError`. Values that are refused raise `ConfigError`. A class variable `GONE` says of keys
+    of earlier versions what became of them, for files that still have them.
     """
 
     def check_all(self: Any) -> None:
@@ -81,6 +83,13 @@ def settings(cls: type[T]) -> type[T]:
             if bounds.refuses(value):
                 found = "none" if value == () else value
                 raise ConfigError(f"{name}: expected {bounds.words}{options}, found {found}")
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            for x in value if isinstance(value, tuple) else (value,):
+                if isinstance(x, float) and math.isnan(x):
+                    raise ConfigError(f"{field.name}: expected a number, found {value}")
+                if isinstance(x, int) and abs(x) > _LARGEST:
+                    raise ConfigError(f"{field.name}: expected at most {_LARGEST}, found {x}")
         try:
             getattr(self, "check", lambda: None)()
         except ConfigError:
