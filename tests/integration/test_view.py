@@ -109,7 +109,7 @@ def test_what_cannot_be_shown_is_named(uniform, tmp_path, capsys):
     assert "none.npz: " in refusal(door("view"), tmp_path / "none.npz")
     assert "empty/config.yaml: no such file" in refusal(door("view"), tmp_path / "empty")
     nowhere = tmp_path / "none" / "a.rrd"
-    assert "none/a.rrd: cannot write" in refusal(door("view"), path, "--output", nowhere)
+    assert "none/a.rrd: expected a folder" in refusal(door("view"), path, "--output", nowhere)
     assert {path.name for path in tmp_path.iterdir()} == before
     for options in (["--movie", "a.mp4"], ["--movie", "a.gif", "--open"]):
         with pytest.raises(SystemExit) as stop:
