@@ -63,8 +63,8 @@ def contents(folder):
 
 
 def test_drives_are_read_as_recorded(collected, maps):
-    drives, terrain = dataset.load_drives(collected, "train")
-    assert drives.state.shape == (40, STEPS + 1, 12) and terrain.worlds == 2
+    drives, terrain = dataset.load_drives(collected, "all")
+    assert drives.state.shape == (46, STEPS + 1, 12) and terrain.worlds == 2
     assert np.all(drives.length == STEPS)
     np.testing.assert_array_equal(terrain.elevation, files.load_map(maps).elevation)
     assert all(getattr(drives.wheels, name) is not None for name in schema.WHEEL_SIGNALS)
@@ -75,8 +75,9 @@ def test_drives_are_read_as_recorded(collected, maps):
     _, meta = schema.read(collected / "world_001.npz")
     assert (meta["map"], meta["world"], meta["simulator"]) == ("world_001.npz", 1, "builtin")
     # No two drives are the same.
-    assert len(np.unique(drives.state[:, 0, 0])) == 40
-    assert len(dataset.load_drives(collected, "test")[0].state) == 2
+    assert len(np.unique(drives.state[:, 0, 0])) == 46
+    parts = [len(dataset.load_drives(collected, split)[0].state) for split in schema.SPLITS]
+    assert parts == [37, 4, 5]
 
 
 def test_going_on_is_as_if_never_stopped(collected, maps, tmp_path, monkeypatch, capsys):
@@ -127,7 +128,7 @@ def test_another_command_does_not_go_on(collected, maps, tmp_path):
     message = refusal(door("collect"), "--output", tmp_path, "--terrain", maps)
     assert "expected a new folder" in message
     assert "none: file: expected" in refusal(
-        door("collect"), "--output", tmp_path, "--terrain", maps / "none"
+        door("collect"), "--output", tmp_path / "new", "--terrain", maps / "none"
     )
     with pytest.raises(SystemExit) as stop:
         door("collect")(["--output", str(tmp_path), "--obstacles", "True"])
