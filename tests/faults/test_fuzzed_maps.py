@@ -23,6 +23,7 @@ from vertiwm_jax.terrain import files, vertibench
 from vertiwm_jax.terrain.classes import STANDARD
 from vertiwm_jax.terrain.map import MapError, TerrainMap
 
+pytestmark = pytest.mark.slow
 EXAMPLES = 300
 GRASS = 3
 HEIGHTS = np.round(5 + np.random.default_rng(0).random((21, 21)), 2).astype(np.float32)
