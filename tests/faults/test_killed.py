@@ -15,13 +15,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from integration import test_fit
 from integration.test_fit import STAGES, TINY
-from integration.test_fit import folder as drives  # noqa: F401
 
 from vertiwm_jax import checkpoints
 from vertiwm_jax.models import files
 from vertiwm_jax.rl import policy
 
+drives = test_fit.folder
 KILLS = 50
 EVERY = 2
 """Iterations between checkpoints."""
@@ -123,7 +124,7 @@ class Command:
 
 
 @pytest.fixture(params=["ppo", "fit"])
-def commands(request, tmp_path, drives):  # noqa: F811
+def commands(request, tmp_path, drives):
     """Two of the same: one that is left alone, and one that is killed."""
     if request.param == "ppo":
         argv, parts = [str(x) for name, value in PPO.items() for x in (f"--{name}", value)], (".",)

@@ -120,7 +120,7 @@ def messages(
                 connection, received, data = next(each)
             except StopIteration:
                 break
-            except Exception as error:
+            except Exception as error:  # Damaged bytes lead rosbags to errors of any kind.
                 # Where a part of the file cannot be read, nobody knows where the next begins.
                 lost = max(sum(c.msgcount for c in found) - read, 1)
                 wrong += [f"a bag that cannot be read after {read} messages: {error}"] * lost

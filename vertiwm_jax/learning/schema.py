@@ -135,8 +135,7 @@ def _stored(path: Path, names: Sequence[str], required: Sequence[str]) -> dict[s
 
 def vehicle_name(path: Path) -> str:
     """What a file, which can be read, calls its vehicle by name or model; or else `UNNAMED`."""
-    with np.load(path, allow_pickle=False) as archive:
-        vehicle = json.loads(str(archive["meta"])).get("vehicle")
+    vehicle = json.loads(str(load_archive(path, ("meta",))["meta"])).get("vehicle")
     said = vehicle if isinstance(vehicle, dict) else {}
     return str(said.get("name") or said.get("model") or UNNAMED)
 
