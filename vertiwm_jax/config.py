@@ -87,7 +87,8 @@ def settings(cls: type[T]) -> type[T]:
             value = getattr(self, field.name)
             for x in value if isinstance(value, tuple) else (value,):
                 if isinstance(x, float) and math.isnan(x):
-                    raise ConfigError(f"{field.name}: expected a number, found {value}")
+                    expected = "finite numbers" if isinstance(value, tuple) else "a number"
+                    raise ConfigError(f"{field.name}: expected {expected}, found {value}")
                 if isinstance(x, int) and abs(x) > _LARGEST:
                     raise ConfigError(f"{field.name}: expected at most {_LARGEST}, found {x}")
         try:
