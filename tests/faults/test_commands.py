@@ -228,12 +228,33 @@ def test_view_of_nothing_is_refused(tmp_path):
     )
 
 
-def test_an_unwritable_file_of_errors_is_refused_first(tmp_path, monkeypatch):
+@pytest.mark.parametrize("test", ["prediction", "floor"])
+def test_an_unwritable_file_of_errors_is_refused_first(tmp_path, monkeypatch, test):
     recordings.write(tmp_path)
-    monkeypatch.setattr(prediction, "predict", begin)
+    monkeypatch.setattr(dataset, "load_drives", begin)
     file = tmp_path / "none" / "errors.json"
-    message = refusal(door("evaluate"), "prediction", "--data", tmp_path, "--json", file)
+    message = refusal(door("evaluate"), test, "--data", tmp_path, "--json", file)
     assert message.startswith(f"error: {file}: expected a folder")
+
+
+@pytest.mark.parametrize("test", ["calibration", "prediction"])
+def test_missing_weights_are_told_before_drives_are_read(tmp_path, monkeypatch, test):
+    recordings.write(tmp_path, **recordings.drives(count=10))
+    monkeypatch.setattr(dataset, "load_drives", begin)
+    weights = tmp_path / "none"
+    message = refusal(door("evaluate"), test, "--data", tmp_path, "--weights", weights)
+    assert message.startswith(f"error: {weights}")
+
+
+def test_a_seed_below_0_is_refused(tmp_path, capsys):
+    data = ["--data", tmp_path]
+    for name, *argv in (
+        ["ppo"], ["compare"], ["fit", *data], ["collect", "--output", tmp_path / "drives"],
+        ["evaluate", "floor", *data], ["evaluate", "navigation", "--policy", "straight"],
+    ):  # fmt: skip
+        with pytest.raises(SystemExit):
+            door(name)([str(word) for word in (*argv, "--seed=-1")])
+        assert "seed: expected at least 0, found -1" in capsys.readouterr().err, name
 
 
 def test_a_misspelt_planner_is_refused_with_what_there_is(tmp_path, monkeypatch):

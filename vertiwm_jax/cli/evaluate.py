@@ -22,8 +22,7 @@ Test = (
 def run(name: str, words: list[str]) -> None:
     off = (tyro.conf.FlagConversionOff,)
     test = arguments.read(Test, name, words, description=__doc__, config=off)
-    if test.output:
-        atomic.expect_folder(test.output)
-    if isinstance(test, PredictionTest) and test.json:
-        atomic.expect_file(test.json)
+    for name, expect in (("output", atomic.expect_folder), ("json", atomic.expect_file)):
+        if place := getattr(test, name, None):
+            expect(place)
     print(f"\n{test.run()}")

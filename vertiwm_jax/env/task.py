@@ -7,7 +7,7 @@ import numpy as np
 from flax import struct
 from gymnax.environments import environment
 
-from vertiwm_jax.config import settings
+from vertiwm_jax.config import CountOrZero, settings
 from vertiwm_jax.dynamics import History, Params
 from vertiwm_jax.env import route
 from vertiwm_jax.env.observation import ObservationSpec
@@ -49,7 +49,7 @@ class NavigationConfig:
     plausible_speed: float = 30.0
     plausible_height: float = 4.0
     plausible_disagreement: float = np.inf
-    settle_steps: int = 15
+    settle_steps: CountOrZero = 15
     embeddings: bool = False
     reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
     route: RouteConfig = RouteConfig()

@@ -63,12 +63,12 @@ class CalibrationTest:
         lengths = self.context, self.horizon, self.horizon
         collection = Collection.of(self.data, self.splits)
         _log.info("%s", collection)
-        windows = []
-        for split in ("validation", "test"):
+        splits: tuple[dataset.Split, ...] = ("validation", "test")
+        for split in splits:
             dataset.expect_drives([collection], split, self.context + self.horizon)
-            drives = dataset.load_drives(self.data, split, self.splits)
-            windows.append(TestWindows.of(*drives, *lengths))
         model = load_model("vertiwm", self.weights)
+        drives = (dataset.load_drives(self.data, split, self.splits) for split in splits)
+        windows = (TestWindows.of(*each, *lengths) for each in drives)
         (before, known), (error, disagreement) = (signs(*model, each) for each in windows)
         bounds = {name: Calibration.measure(before, signal) for name, signal in known.items()}
         best = next(iter(bounds))

@@ -12,7 +12,7 @@ import tyro
 from vertiwm_jax import atomic
 from vertiwm_jax import config as configuration
 from vertiwm_jax import runs as run_folders
-from vertiwm_jax.config import AtLeastOne, ConfigError, Count
+from vertiwm_jax.config import AtLeastOne, ConfigError, Count, CountOrZero
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.episodes import NavigationResult
@@ -57,7 +57,7 @@ class CompareConfig:
     """Tasks in a world."""
     jobs: Count = 1
     """Processes that drive, in Chrono."""
-    seed: int = 0
+    seed: CountOrZero = 0
     """Draws the worlds; how policies are trained has seeds of its own."""
     settings: Path | None = None
     """Folder with `ppo.yaml`, `sac.yaml` and `td3.yaml`; those of the package by default."""

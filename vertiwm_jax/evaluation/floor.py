@@ -57,7 +57,7 @@ class FloorTest:
     """Steps before the vehicles part."""
     horizons: Annotated[tuple[Count, ...], AtLeastOne] = (16, 50, 100)
     """Steps after which their distance is told."""
-    seed: int = 0
+    seed: CountOrZero = 0
     """Decides to which sides vehicles are moved and pushed."""
     jobs: Count = 1
     """Processes that simulate."""

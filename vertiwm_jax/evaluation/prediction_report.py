@@ -81,8 +81,6 @@ class PredictionTest:
         for collection in collections:
             _log.info("%s; predicted: %s", collection, split)
         dataset.expect_drives(collections, split, self.context + max(self.horizons))
-        drives, terrain = dataset.load_drives(self.data, split, self.splits)
-        every, tests = TestWindows.nested(drives, terrain, self.context, self.horizons, self.stride)
         driven = vehicle.load(self.vehicle).vehicle
         models: dict[str, tuple[Dynamics, Params]] = {
             name: load_model(name, self.weights, vehicle=driven, soil=self.soil)
@@ -93,6 +91,8 @@ class PredictionTest:
             models |= {f"{folder.name}: {part}": model for part, model in fitted.items()}
         models["kinematic bicycle"] = KinematicBicycle(), bicycle_of(driven)
         models["constant velocity"] = ConstantVelocity(), None
+        drives, terrain = dataset.load_drives(self.data, split, self.splits)
+        every, tests = TestWindows.nested(drives, terrain, self.context, self.horizons, self.stride)
         predicted = {}
         with Progress(len(models), "models") as progress:
             for name, model in models.items():

@@ -14,7 +14,7 @@ import numpy as np
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import figures, machine, runs
-from vertiwm_jax.config import ConfigError, Count, settings
+from vertiwm_jax.config import ConfigError, Count, CountOrZero, settings
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.episodes import NavigationResult, run_episodes
@@ -80,7 +80,7 @@ class NavigationTest:
     """How many worlds of each suite; as many as after training by default."""
     pairs: Count | None = None
     """Tasks in a world; as many as after training by default."""
-    seed: int | None = None
+    seed: CountOrZero | None = None
     """Draws other procedural worlds than those held out."""
     sensing_range: float | None = None
     """Range of sensors, m, inf to know all of the map; by default as in training."""

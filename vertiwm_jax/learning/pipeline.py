@@ -14,7 +14,7 @@ from typing import Any, Literal, Self
 import jax
 import numpy as np
 
-from vertiwm_jax.config import settings
+from vertiwm_jax.config import CountOrZero, settings
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning import autoencoders, calibration, dataset, stages, windows
 from vertiwm_jax.learning.dataset import Collection, Drives, Split, SplitConfig, WheelSignals
@@ -88,7 +88,7 @@ class PipelineConfig:
     splits: SplitConfig = dataset.FITTED
     """How drives are shared out whose files do not say what they are for, and which worlds are left
     out of the fit."""
-    seed: int = 0
+    seed: CountOrZero = 0
     """Decides everything that is random."""
     model: ModelConfig = ModelConfig()
     """What is fitted."""

@@ -9,7 +9,7 @@ import jax
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import machine, training
-from vertiwm_jax.config import Count
+from vertiwm_jax.config import Count, CountOrZero
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import controllers, suites
 from vertiwm_jax.env.agent import Agent, Policy
@@ -50,7 +50,7 @@ class TaskConfig:
         "operands": "is now compute_dtype",
     }
 
-    seed: int = 0
+    seed: CountOrZero = 0
     """Decides everything that is random."""
     vehicle: str = HMMWV
     """What the built-in simulator drives: the name of a shipped vehicle, or a YAML file of

@@ -15,7 +15,7 @@ import numpy as np
 
 from vertiwm_jax import atomic
 from vertiwm_jax import config as configuration
-from vertiwm_jax.config import Bounds, ConfigError, Count, settings
+from vertiwm_jax.config import Bounds, ConfigError, Count, CountOrZero, settings
 from vertiwm_jax.env.agent import Policy, Reactive
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.suites import Tasks
@@ -78,7 +78,7 @@ class CollectConfig:
     """Duration of a drive."""
     policy: Path | None = None
     """Run folder of a policy that drives from goal to goal; the paper's sinusoids by default."""
-    seed: int = 0
+    seed: CountOrZero = 0
     """Decides everything that is random."""
     jobs: Count = 1
     """Processes that simulate."""
