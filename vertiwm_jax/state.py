@@ -53,7 +53,7 @@ class VehicleState:
 class Command:
     """What a driver asks for during one step (the paper's u_t).
 
-    speed: `[...]` commanded forward speed, m/s.
+    speed: `[...]` commanded forward speed, m/s; negative backwards.
     steering: `[...]` front-wheel angle, rad, left positive.
     """
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.mechanics.bekker_wong import BekkerWongParams
+from vertiwm_jax.mechanics.drivetrain import SPIN_FLOOR
 from vertiwm_jax.mechanics.kinematic import bicycle_of, place
 from vertiwm_jax.mechanics.simulator import (
     Simulator,
@@ -143,10 +144,44 @@ def test_reaches_the_commanded_speed(speed):
     np.testing.assert_allclose(rolled, speed, rtol=0.03)
 
 
-def test_has_no_reverse():
+def test_drives_backwards():
     flat = ground()
-    state = drive(flat, at_rest(flat), -2.0).state
-    assert np.abs(state.velocity[-1]).max() < 0.02
+    driven = drive(flat, at_rest(flat, x=15), -2.0, 0.2)
+    assert driven.state.velocity[-1, 0] == pytest.approx(-2.0, rel=0.03)
+    # The front wheels lead the tail to their other side.
+    radius = driven.state.velocity[-1, 0] / driven.state.angular_velocity[-1, 2]
+    assert radius == pytest.approx(float(VEHICLE.wheelbase) / np.tan(0.2), rel=0.08)
+
+
+@pytest.mark.parametrize(("before", "after"), [(6.0, -2.0), (-6.0, 2.0)])
+def test_brakes_until_the_gear_can_be_shifted(before, after):
+    """With weak brakes, as a vehicle that uses its engine stops sooner."""
+    weak = replace(PARAMS, vehicle=replace(VEHICLE, brake_torque=jnp.float32(600.0)))
+    flat, gears = ground(), np.sign([before, after])
+    start = replace(at_rest(flat, x=-3 * before), velocity=jnp.array([before, 0.0, 0.0]))
+    history = SIMULATOR.init(weak, flat, start)
+    history = replace(history, gear=jnp.float32(gears[0]))
+    commands = Command(jnp.full(STEPS, after), jnp.zeros(STEPS))
+    states, histories = advance(weak, flat, history, start, commands)
+    speed, gear = (np.asarray(x) for x in (states.velocity[:, 0], histories.gear))
+    assert gear[0] == gears[0] and gear[-1] == gears[1]
+    shifted = np.argmax(gear == gears[1])
+    # Four brakes stop the mass and the spin of the wheels, the less the slower these are.
+    radius = float(VEHICLE.wheel_radius)
+    spin = np.abs(speed[1:shifted] + speed[: shifted - 1]) / 2 / radius
+    inertia = float(VEHICLE.mass) + 4 * float(VEHICLE.wheel_inertia) / radius**2
+    expected = -gears[0] * 4 * 600 / radius * spin / (spin + SPIN_FLOOR) / inertia
+    np.testing.assert_allclose(np.diff(speed)[3:20] / 0.1, expected[3:20], rtol=0.02)
+    assert speed[-1] == pytest.approx(after, rel=0.1)
+    assert abs(speed[shifted - 1]) < 0.6
+
+
+def test_a_vehicle_that_rolls_back_in_forward_gear_drives_on():
+    flat = ground()
+    start = replace(at_rest(flat), velocity=jnp.array([-2.0, 0.0, 0.0]))
+    driven = drive(flat, start, 3.0)
+    assert (driven.history.gear == 1).all()
+    assert driven.history.force[2, :, 1].sum() > 0.5 * WEIGHT
 
 
 @pytest.mark.parametrize("steering", [0.1, -0.2, 0.35])

@@ -5,9 +5,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle
 from vertiwm_jax.state import Command
 
+SHIFT_FROUDE = 0.21
+"""Speed over sqrt(g r), r a wheel's radius, below which gears are shifted: 0.45 m/s of an HMMWV."""
 SPIN_FLOOR = 0.5
 """Wheel speed, rad/s, below which a locked brake lets a wheel creep."""
 
@@ -16,12 +18,14 @@ class Actuation(NamedTuple):
     """Inputs of the wheels.
 
     steering: `[]` rad of the front wheels, as far as they have turned. angle: `[4]` rad of each.
+    gear: `[]` 1 forward, -1 reverse.
     torque: N m on each wheel, `[]` or `[4]`.
     brake: `[4]` N m s/rad, braking torque per wheel speed.
     """
 
     steering: jax.Array
     angle: jax.Array
+    gear: jax.Array
     torque: jax.Array
     brake: jax.Array
 
@@ -31,21 +35,28 @@ def actuate(
     command: Command,
     forward: jax.Array,
     steering: jax.Array,
+    gear: jax.Array,
     wheel_speed: jax.Array,
     seconds: float,
 ) -> Actuation:
     """The inputs of the wheels for a command in a sub-step. Physics reads commands only here.
 
-    Speed is controlled by a pedal in proportion to its error. Differentials are open: all wheels
+    Speed is controlled by a pedal in proportion to its error. A negative speed asks for the reverse
+    gear, which is shifted to once the vehicle is nearly at rest; until then it brakes, and likewise
+    on the way back to a speed of zero or more. Differentials are open: all wheels
     get the same torque, limited by power at their mean speed; the engine fades out over the upper
     half of its speed range.
 
     Args:
         forward: `[]` m/s, speed of the vehicle.
-        steering: `[]` rad, of the front wheels before.
+        steering: `[]` rad, of the front wheels before; gear: `[]` before, 1 or -1.
         wheel_speed: `[4]` rad/s.
     """
+    wanted = jnp.where(command.speed < 0, -1.0, 1.0)
+    slow = SHIFT_FROUDE * jnp.sqrt(GRAVITY * jnp.mean(vehicle.wheel_radius))
+    gear = jnp.where(jnp.abs(forward) < slow, wanted, gear)
     pedal = jnp.clip(vehicle.speed_gain * (command.speed - forward), -1.0, 1.0)
+    pedal = jnp.where(gear == wanted, gear * pedal, -jnp.abs(pedal))
     target = jnp.clip(command.steering, -vehicle.steering_limit, vehicle.steering_limit)
     turn = vehicle.steering_rate * seconds
     steering = steering + jnp.clip(target - steering, -turn, turn)
@@ -56,6 +67,7 @@ def actuate(
     return Actuation(
         steering=steering,
         angle=jnp.concatenate([jnp.full(2, steering), jnp.zeros(2)]),
-        torque=jnp.maximum(pedal, 0.0) * torque,
+        gear=gear,
+        torque=gear * jnp.maximum(pedal, 0.0) * torque,
         brake=jnp.maximum(-pedal, 0.0) * brake,
     )

@@ -73,6 +73,7 @@ class SimulatorHistory:
     wheel_speed: `[4]` rad/s, positive forward.
     travel: `[4]` m, height of the wheel centers in the body.
     steering: `[]` rad, angle of the front wheels.
+    gear: `[]` 1 forward, -1 reverse.
     sinkage: `[4]` m, of the wheels in soil; 0 on rigid ground.
     rut: `[2]` m, depth of the tracks that the rear wheels find, left and right.
     wheels: how each wheel met the ground in the last sub-step.
@@ -83,6 +84,7 @@ class SimulatorHistory:
     wheel_speed: jax.Array
     travel: jax.Array
     steering: jax.Array
+    gear: jax.Array
     sinkage: jax.Array
     rut: jax.Array
     wheels: GroundContact
@@ -116,7 +118,8 @@ class Simulator:
     def init(
         self, params: SimulatorParams, terrain: TerrainMap, state: VehicleState
     ) -> SimulatorHistory:
-        """Wheels roll without slip, stand where the springs carry the weight, steer ahead."""
+        """Wheels roll without slip, stand where the springs carry the weight, steer ahead; the gear
+        is forward."""
         vehicle, none = params.vehicle, jnp.zeros(4)
         load, travel = vehicle.mass * GRAVITY / 4, vehicle.travel_at_rest
         position = Vector.of(state.position)
@@ -125,6 +128,7 @@ class Simulator:
             wheel_speed=jnp.full(4, state.velocity[0] / vehicle.wheel_radius),
             travel=travel,
             steering=jnp.zeros(()),
+            gear=jnp.ones(()),
             sinkage=none,
             rut=jnp.zeros(2),
             wheels=contacts(vehicle, terrain, position, axes, travel, none, none)[0],
@@ -191,7 +195,7 @@ def _substep(
     center = Vector.of(vehicle.centre_of_mass)
     forward = body.twist.linear.x
     spin, before = history.wheel_speed, history.sinkage
-    driven = actuate(vehicle, command, forward, history.steering, spin, seconds)
+    driven = actuate(vehicle, command, forward, history.steering, history.gear, spin, seconds)
     where = body.position, axes, history.travel, driven.angle
     wheels, hull = contacts(vehicle, terrain, *where, before)
     n, arm = wheels.normal, wheels.point.plus(center, -1.0)
@@ -243,6 +247,7 @@ def _substep(
             vehicle.free_travel + radius,
         ),
         steering=driven.steering,
+        gear=driven.gear,
         sinkage=jnp.where(wheels.edge, before, sinkage),
         rut=history.rut + fresh * (sinkage[:2] - history.rut),
         wheels=wheels,
