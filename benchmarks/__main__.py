@@ -13,8 +13,8 @@ import benchmarks
 from benchmarks._harness import cell
 from vertiwm_jax import atomic
 
-_APART = {"gpu", "recurrent_baseline", "soil_adaptation", "turns"}
-"""Those that need a GPU or a folder of drives; and what runs another one."""
+_APART = {"gpu", "recurrent_baseline", "skid_steered", "soil_adaptation", "turns"}
+"""Those that need a GPU or recorded drives; and what runs another one."""
 _NEEDS = {
     "chrono": ("pychrono", "see docs/collect.md"),
     "torch_peer": ("torch", 'pip install -e ".[peers]"'),

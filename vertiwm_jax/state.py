@@ -54,7 +54,8 @@ class Command:
     """What a driver asks for during one step (the paper's u_t).
 
     speed: `[...]` commanded forward speed, m/s; negative backwards.
-    steering: `[...]` front-wheel angle, rad, left positive.
+    steering: `[...]` front-wheel angle, rad, left positive; of a skid-steered vehicle the yaw rate,
+        rad/s.
     """
 
     speed: jax.Array

@@ -13,6 +13,8 @@ from vertiwm_jax.dynamics import rollout, warm_up
 from vertiwm_jax.mechanics.kinematic import (
     BicycleParams,
     ConstantVelocity,
+    DifferentialDrive,
+    DifferentialParams,
     KinematicBicycle,
     place,
 )
@@ -79,6 +81,33 @@ def test_bicycle_drives_a_circle(steering):
     course_speed = np.hypot(driven.velocity[-1, 0], driven.velocity[-1, 1])
     assert course_speed == pytest.approx(abs(yaw_rate) * expected, rel=1e-4)
     assert float(driven.velocity[-1, 0]) == pytest.approx(speed, rel=1e-4)
+
+
+def test_differential_drive_turns_on_the_spot_and_follows_shares_of_its_commands():
+    numbers = 0.5, 0.6, 0.45, 0.8, 0.25, 0.1, 0.2, 0.0, 0.0
+    params = DifferentialParams(*map(jnp.float32, numbers))
+    state = VehicleState.from_vector(jnp.zeros(12).at[2].set(50.45))
+    turn = Command(jnp.zeros(20), jnp.full(20, 2.0))
+    turned = rollout(DifferentialDrive(), params, plane(0, 0), state, turn)
+    np.testing.assert_allclose(turned.position[:, :2], 0, atol=1e-6)
+    rate = 0.5 * (1 - np.exp(-0.1 * np.arange(1, 21) / 0.2))
+    np.testing.assert_allclose(turned.angular_velocity[:, 2], rate, rtol=1e-4)
+    np.testing.assert_allclose(turned.rpy[-1, 2], 0.1 * rate.sum(), rtol=1e-4)
+    ahead = Command(jnp.full(20, -1.0), jnp.zeros(20))
+    driven = rollout(DifferentialDrive(), params, plane(0, 0), state, ahead)
+    speed = -0.8 * (1 - np.exp(-np.arange(1, 21)))
+    np.testing.assert_allclose(driven.velocity[:, 0], speed, rtol=1e-4)
+    np.testing.assert_allclose(driven.position[-1, 0], 0.1 * speed.sum(), rtol=1e-4)
+
+
+def test_differential_drive_drifts_outwards_and_turns_about_its_offset():
+    numbers = 0.5, 0.6, 0.45, 1.0, 1.0, 0.01, 0.01, 0.1, 0.2
+    params = DifferentialParams(*map(jnp.float32, numbers))
+    state = VehicleState.from_vector(jnp.zeros(12).at[2].set(50.45))
+    for turn in (0.5, -0.5):
+        command = Command(jnp.full(5, 2.0), jnp.full(5, turn))
+        driven = rollout(DifferentialDrive(), params, plane(0, 0), state, command)
+        np.testing.assert_allclose(driven.velocity[-1, 1], turn * (0.1 - 0.2 * 2), rtol=1e-4)
 
 
 def test_bicycle_approaches_the_commanded_speed_with_its_lag():

@@ -88,12 +88,87 @@ class KinematicBicycle:
         # Speed is along the slope; its plan view is shorter.
         level = jnp.cos(state.rpy[1]) * STEP_SECONDS * speed / jnp.cos(side_slip)
         xy = state.position[:2] + level * jnp.stack([jnp.cos(course), jnp.sin(course)])
-        yaw = geometry.wrap(state.rpy[2] + STEP_SECONDS * yaw_rate)
-        there = place(terrain, xy, yaw, vehicle=params)
-        velocity = jnp.stack([speed, sideways, 0.0 * speed])
-        tilt_rate = geometry.wrap(there.rpy - state.rpy)[:2] / STEP_SECONDS
-        angular_velocity = jnp.concatenate([tilt_rate, yaw_rate[None]])
-        return replace(there, velocity=velocity, angular_velocity=angular_velocity), ()
+        yaw = state.rpy[2] + STEP_SECONDS * yaw_rate
+        return _driven(terrain, params, state, xy, yaw, (speed, sideways, yaw_rate)), ()
+
+
+@struct.dataclass
+class DifferentialParams:
+    """Of a vehicle whose sides turn it, which follows its commands but for slip.
+
+    wheelbase and track, m; ride_height of the body origin above the ground, m.
+    speed_gain, turn_gain: `[]` share of the commanded speed and yaw rate that is driven.
+    speed_lag, turn_lag: `[]` s, with which they are followed.
+    offset: `[]` m, by which the point that does not move sideways lies behind the body origin.
+    drift: `[]` s, sideways speed, outwards, per speed and yaw rate.
+    """
+
+    wheelbase: jax.Array
+    track: jax.Array
+    ride_height: jax.Array
+    speed_gain: jax.Array
+    turn_gain: jax.Array
+    speed_lag: jax.Array
+    turn_lag: jax.Array
+    offset: jax.Array
+    drift: jax.Array
+
+
+@dataclass(frozen=True)
+class DifferentialDrive:
+    """A skid-steered vehicle, commanded by speed and yaw rate, that lies on the ground under its
+    wheels. Speed and yaw rate follow a share of the commands with first-order lags."""
+
+    @float32
+    def init(
+        self, params: DifferentialParams, terrain: TerrainMap, state: VehicleState
+    ) -> tuple[()]:
+        return ()
+
+    @float32
+    def step(
+        self,
+        params: DifferentialParams,
+        terrain: TerrainMap,
+        history: tuple[()],
+        state: VehicleState,
+        command: Command,
+    ) -> tuple[VehicleState, tuple[()]]:
+        def followed(wanted: jax.Array, now: jax.Array, lag: jax.Array) -> jax.Array:
+            return wanted + (now - wanted) * jnp.exp(-STEP_SECONDS / lag)
+
+        speed = followed(params.speed_gain * command.speed, state.velocity[0], params.speed_lag)
+        turning = state.angular_velocity[2]
+        yaw_rate = followed(params.turn_gain * command.steering, turning, params.turn_lag)
+        sideways = (params.offset - params.drift * speed) * yaw_rate
+        yaw = state.rpy[2] + STEP_SECONDS * yaw_rate
+        course = state.rpy[2] + 0.5 * STEP_SECONDS * yaw_rate
+        cos, sin = jnp.cos(course), jnp.sin(course)
+        # Speed is along the slope; its plan view is shorter.
+        ahead, left = jnp.cos(state.rpy[1]) * speed, jnp.cos(state.rpy[0]) * sideways
+        moved = jnp.stack([ahead * cos - left * sin, ahead * sin + left * cos])
+        xy = state.position[:2] + STEP_SECONDS * moved
+        return _driven(terrain, params, state, xy, yaw, (speed, sideways, yaw_rate)), ()
+
+
+def _driven(
+    terrain: TerrainMap,
+    params: BicycleParams | DifferentialParams,
+    state: VehicleState,
+    xy: jax.Array,
+    yaw: jax.Array,
+    motion: tuple[jax.Array, jax.Array, jax.Array],
+) -> VehicleState:
+    """The state on the ground at `xy` and `yaw`, after one step.
+
+    motion: `[]` speed ahead and to the left, m/s, and yaw rate, rad/s.
+    """
+    there = place(terrain, xy, geometry.wrap(yaw), vehicle=params)
+    speed, sideways, yaw_rate = motion
+    velocity = jnp.stack([speed, sideways, 0.0 * speed])
+    tilt_rate = geometry.wrap(there.rpy - state.rpy)[:2] / STEP_SECONDS
+    angular_velocity = jnp.concatenate([tilt_rate, yaw_rate[None]])
+    return replace(there, velocity=velocity, angular_velocity=angular_velocity)
 
 
 @float32
@@ -102,7 +177,7 @@ def place(
     xy: ArrayLike | None = None,
     yaw: ArrayLike = 0.0,
     *,
-    vehicle: Vehicle | BicycleParams | None = None,
+    vehicle: Vehicle | BicycleParams | DifferentialParams | None = None,
     speed: ArrayLike = 0.0,
 ) -> VehicleState:
     """Places a vehicle on the plane through the ground under its four wheels.
