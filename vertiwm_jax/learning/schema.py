@@ -67,7 +67,7 @@ _LIMITS = (
     ("state", slice(9, 12), 10 * np.pi, "angular velocity in rad/s"),
     ("control", 0, 50.0, "commanded speed in m/s"),
     ("control", 1, np.pi / 2, "front-wheel angle in rad"),
-    ("wheel_omega", _ALL, 1e3, "wheel speed in rad/s"),
+    ("wheel_omega", _ALL, 3e3, "wheel speed in rad/s"),
     ("wheel_sinkage", _ALL, 10.0, "depth in m"),
     ("wheel_force", _ALL, 1e6, "force in N"),
     ("chassis_force", _ALL, 1e6, "force in N"),
