@@ -75,17 +75,31 @@ def load(path: str | Path, like: State) -> State:
     """
     path = Path(path).absolute()
     stored = named_leaves(jax.eval_shape(hosts.without_keys, like))
+    _check(path, stored, outline(path))
+    with _reading(path):
+        arrays = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in stored.items()}
+        restored = jax.device_put(ocp.load(str(path), arrays))
+    leaves = [restored[name] for name in stored]
+    return hosts.with_keys(like, jax.tree.unflatten(jax.tree.structure(like), leaves))
+
+
+def outline(path: str | Path) -> dict[str, jax.ShapeDtypeStruct]:
+    """Shapes and types of the leaves of a checkpoint by dotted name; raises `CheckpointError`."""
+    path = Path(path).absolute()
+    with _reading(path):
+        found = ocp.metadata(str(path)).metadata
+        return {name: jax.ShapeDtypeStruct(x.shape, x.dtype) for name, x in found.items()}
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """In which this host reads by itself, and a damaged checkpoint raises `CheckpointError`."""
     try:
         with _quiet(), _alone():
-            found = ocp.metadata(str(path)).metadata
-            _check(path, stored, found)
-            arrays = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in stored.items()}
-            restored = jax.device_put(ocp.load(str(path), arrays))
+            yield
     except (OSError, ValueError, KeyError) as error:
         reason = str(error).splitlines()[0]
         raise CheckpointError(f"{path}: not a readable checkpoint: {reason}") from error
-    leaves = [restored[name] for name in stored]
-    return hosts.with_keys(like, jax.tree.unflatten(jax.tree.structure(like), leaves))
 
 
 def _alone() -> ocp.Context:

@@ -15,7 +15,7 @@ POWER: dict[str, float] = {
     "wheel_width": 1, "wheel_inertia": 5, "wheel_weight": 3, "spring": 2, "damper": 2.5,
     "free_travel": 1, "steering_limit": 0, "steering_rate": -0.5, "speed_gain": -0.5,
     "wheel_torque": 4, "wheel_power": 3.5, "wheel_speed_limit": -0.5, "brake_torque": 4,
-    "tyre_friction": 0, "hull": 1, "length": 1, "width": 1,
+    "tyre_friction": 0, "hull": 1, "length": 1, "width": 1, "driven": 0, "locked": 0,
     # Of a soil: its stresses grow as its depths do. For Bekker's moduli see `scaled`.
     "cohesion": 1, "shear_modulus": 1,
     # Of a map.
@@ -35,7 +35,7 @@ def scaled(quantities: Quantities, factor: float) -> Quantities:
         elif name in ("kc", "kphi"):  # Pressure is (kc / width + kphi) depth^n.
             power = (2 if name == "kc" else 1) - vars(quantities)["n"]
             changes[name] = value * factor**power
-        elif name in POWER:
+        elif name in POWER and value is not None:
             changes[name] = _times(value, factor ** POWER[name])
     return replace(cast(Any, quantities), **changes)
 

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from vertiwm_jax.mechanics.newton_euler import (
     ContactForce,
     DampedForce,
+    Shaft,
     Twist,
     _solve_spd,
     advance_twist,
@@ -79,6 +80,31 @@ def test_step_solves_the_dense_system(seed):
     change = np.linalg.solve(matrix, seconds * force)
     np.testing.assert_allclose(array(twist.linear), linear + change[:3], atol=1e-4)
     np.testing.assert_allclose(array(twist.angular), angular + change[3:], atol=1e-4)
+
+
+def test_a_shaft_is_one_more_unknown_of_the_dense_system():
+    """Its spin is eliminated; here it is solved for beside the velocities."""
+    rng = np.random.default_rng(0)
+    seconds, inertia = 0.02, 300.0
+    direction = rng.normal(size=(4, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    arm, push, grip = rng.normal(size=(4, 3)), 5000 * rng.normal(size=4), 1e4 * rng.random(4)
+    jacobian = np.concatenate([direction, np.cross(arm, direction)], axis=1)
+    pull = 0.4 * grip
+    matrix = np.zeros((7, 7))
+    matrix[:6, :6] = np.diag([MASS] * 3 + list(INERTIA))
+    matrix[:6, :6] += seconds * jacobian.T @ (grip[:, None] * jacobian)
+    matrix[:6, 6] = matrix[6, :6] = -seconds * jacobian.T @ pull
+    matrix[6, 6] = inertia
+    expected = np.linalg.solve(matrix, np.append(seconds * jacobian.T @ push, 0.0))
+
+    along, forces = vector(direction), map(jnp.asarray, (push, grip))
+    still, none = Twist(vector(np.zeros(3)), vector(np.zeros(3))), vector(np.zeros(3))
+    shaft = Shaft(vector(arm), along.times(jnp.asarray(pull)), jnp.float32(inertia))
+    contacts = [ContactForce.of(vector(arm), DampedForce(along, *forces))]
+    twist = advance_twist(still, jnp.float32(MASS), vector(INERTIA), none, contacts, seconds, shaft)
+    found = [*array(twist.linear), *array(twist.angular), shaft.gained(still, twist, seconds)]
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_cholesky_solves_a_batch_of_systems():

@@ -18,7 +18,7 @@ from vertiwm_jax.mechanics.simulator import (
     SimulatorParams,
     chrono_like,
 )
-from vertiwm_jax.mechanics.vehicle import GRAVITY, load_vehicle
+from vertiwm_jax.mechanics.vehicle import GRAVITY, load, load_vehicle, stack
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -298,6 +298,65 @@ def test_every_wheel_may_be_of_its_own():
     level = ground()
     pull = drive(level, at_rest(level), 3.0, params=driven).history.force[5, :, 1]
     assert (pull[:2] < 1).all() and (pull[2:] > 100).all()
+
+
+def of_layout(**layout: str) -> SimulatorParams:
+    return chrono_like(replace(load("hmmwv"), **layout).vehicle)
+
+
+@pytest.mark.parametrize(
+    ("layout", "one_speed"),
+    [
+        ({"locked": "all"}, [(0, 1), (1, 2), (2, 3)]),
+        ({"locked": "rear"}, [(2, 3)]),
+        ({"drive": "front", "locked": "front"}, [(0, 1)]),
+    ],
+)
+def test_locked_wheels_turn_at_one_speed(layout, one_speed):
+    terrain = ground(waves)
+    spin = drive(terrain, at_rest(terrain), 3.0, 0.3, of_layout(**layout)).history.wheel_speed
+    pairs = [(0, 1), (1, 2), (2, 3)]
+    apart = {pair: np.abs(spin[:, pair[0]] - spin[:, pair[1]]).max() for pair in pairs}
+    assert all((apart[pair] < 1e-4) == (pair in one_speed) for pair in pairs), apart
+
+
+@pytest.mark.parametrize(("drive_of", "driven"), [("rear", [2, 3]), ("front", [0, 1])])
+def test_the_engine_drives_the_wheels_of_its_axle_alone(drive_of, driven):
+    flat = ground()
+    pull = drive(flat, at_rest(flat), 3.0, params=of_layout(drive=drive_of)).history.force[5, :, 1]
+    assert (pull[driven] > 100).all() and (np.delete(pull, driven) < 1).all()
+
+
+def test_a_locked_vehicle_pulls_with_the_wheels_that_have_grip():
+    """On a slope, with ice below the rear wheels: one that is open spins there and slides back."""
+    friction = np.tile(np.where(np.arange(64) < 32, 0.02, 0.8), (64, 1))
+    heights = np.tile(0.25 * (np.arange(65) - 32.0), (65, 1))
+    slope = TerrainMap.from_array(heights, "concrete", friction=friction)
+    params = of_layout(), of_layout(locked="all")
+    free, locked = (drive(slope, at_rest(slope), 2.0, params=each) for each in params)
+    assert free.state.position[-1, 0] < -5 and locked.state.position[-1, 0] > 5
+    assert np.ptp(free.history.wheel_speed[10]) > 50
+
+
+def test_locked_differentials_resist_turning_and_vehicles_of_all_layouts_are_one_program():
+    flat = ground()
+    layouts = [{}, {"locked": "all"}, {"drive": "rear"}, {"drive": "rear", "locked": "rear"}]
+    each = [of_layout(**layout) for layout in layouts]
+    apart = [drive(flat, at_rest(flat), 2.0, 0.3, params) for params in each]
+    yaw_rate = [driven.state.angular_velocity[-1, 2] for driven in apart]
+    assert yaw_rate[1] < 0.9 * yaw_rate[0] and yaw_rate[3] < 0.95 * yaw_rate[2]
+
+    several = stack([load("hmmwv").vehicle, *(params.vehicle for params in each[1:])])
+    assert several.mass.shape == (4,) and several.select(jnp.int32(1)).locked.shape == (4,)
+
+    def driving(vehicle):
+        params = replace(PARAMS, vehicle=vehicle)
+        commands = Command(jnp.full(STEPS, 2.0), jnp.full(STEPS, 0.3))
+        return rollout(SIMULATOR, params, flat, at_rest(flat), commands)
+
+    together = jax.jit(jax.vmap(driving))(several)
+    expected = np.stack([driven.state.vector for driven in apart])
+    np.testing.assert_allclose(together.vector, expected, atol=1e-3)
 
 
 def test_turning_and_moving_the_world_turns_and_moves_the_drive():

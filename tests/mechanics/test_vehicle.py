@@ -54,11 +54,14 @@ def test_a_rover_at_full_size_is_about_an_hmmwv():
         ("hull", [0.1, 0.1, 0.2, 0.1], "hull: expected half the length and half the width"),
         ("inertia", [1.0, 2.0, 9.0], "inertia: expected no moment larger than the sum"),
         ("wheels", 4, "wheels: unknown key"),
+        ("drive", "back", "drive: expected one of 'all', 'rear', 'front', found 'back'"),
+        ("locked", "rear", "locked: expected none or front, as these wheels are driven"),
+        ("wheel_radius", [0.5, 0.0], "wheel_radius: expected more than 0, found (0.5, 0.0)"),
         ("mass", "heavy", "mass: expected float, found 'heavy'"),
     ],
 )
 def test_what_cannot_be_a_vehicle_is_named(tmp_path, field, value, words):
-    numbers = yaml.safe_load(config.dump(ROVER)) | {field: value}
+    numbers = yaml.safe_load(config.dump(replace(ROVER, drive="front"))) | {field: value}
     file = tmp_path / "mine.yaml"
     file.write_text(yaml.safe_dump(numbers).replace("'.nan'", ".nan").replace("'.inf'", ".inf"))
     with pytest.raises(ConfigError) as refused:
@@ -99,3 +102,28 @@ def test_the_same_drive_at_four_times_the_size_takes_twice_as_long():
     np.testing.assert_allclose(large.position[1::2] / 4, small.position, atol=0.02 * travelled)
     np.testing.assert_allclose(large.rpy[1::2], small.rpy, atol=0.05)
     np.testing.assert_allclose(large.velocity[1::2, 0] / 2, small.velocity[:, 0], atol=0.1)
+
+
+def test_axles_may_differ():
+    own = replace(ROVER, scale=1.0, track=(0.2, 0.24), wheel_radius=(0.05, 0.06), wheel_width=0.05)
+    found = own.vehicle
+    np.testing.assert_allclose(found.wheel_position[:, 1], [0.1, -0.1, 0.12, -0.12])
+    np.testing.assert_allclose(found.wheel_radius, [0.05, 0.05, 0.06, 0.06])
+    assert found.wheel_width.shape == () and found.track == pytest.approx(0.22)
+    # The body origin is between the wheel centers: level ground is below it by the mean radius.
+    resting = 0.055 - found.travel_at_rest.mean()
+    assert found.ride_height == pytest.approx(resting)
+
+
+def test_vehicles_are_stacked_and_selected():
+    unequal = replace(ROVER, wheel_radius=(0.05, 0.06), drive="rear", locked="rear").vehicle
+    several = vehicle.stack([load_vehicle(), unequal])
+    first, second = (several.select(jnp.int32(i)) for i in range(2))
+    np.testing.assert_array_equal(second.locked, [0, 0, 1, 1])
+    np.testing.assert_array_equal(first.driven, [1, 1, 1, 1])
+    np.testing.assert_array_equal(first.locked, [0, 0, 0, 0])
+    np.testing.assert_allclose(first.wheel_radius, [0.467] * 4)
+    np.testing.assert_allclose(second.wheel_radius, unequal.wheel_radius)
+    assert first.mass == load_vehicle().mass and second.mass == unequal.mass
+    # What none of them has stays away.
+    assert vehicle.stack([load_vehicle()] * 2).locked is None

@@ -1,5 +1,6 @@
 """Models by name, in the forms that drive, plan and are seen by."""
 
+from dataclasses import replace
 from functools import partial
 
 import chex
@@ -11,6 +12,8 @@ from world_model.examples import commands, driving, one, rough
 
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import embedding, rollout
+from vertiwm_jax.mechanics.simulator import chrono_like
+from vertiwm_jax.mechanics.vehicle import load
 from vertiwm_jax.models import files
 from vertiwm_jax.models.config import ModelConfig, with_soil
 from vertiwm_jax.models.registry import load_fitted, load_model
@@ -35,6 +38,16 @@ def drive(model, params, states):
 def test_a_model_that_keeps_latents_drives_alike(name):
     expected, found = (drive(*load_model(name, embeddings=kept), STATES) for kept in (False, True))
     np.testing.assert_allclose(found.vector, expected.vector, atol=1e-3)
+
+
+def test_a_model_moves_the_vehicle_that_it_was_saved_with(tmp_path):
+    """Of any layout, whose leaves those of the HMMWV do not have."""
+    driven = replace(load("rover"), drive="rear", locked="rear", wheel_radius=(0.05, 0.06)).vehicle
+    config = ModelConfig(parts=("nesam",), terrain="none")
+    params = config.init_params(jax.random.key(0), chrono_like(driven))
+    files.save(tmp_path, config, params)
+    found = files.load(tmp_path)[1].vehicle
+    chex.assert_trees_all_equal(jax.device_get(found), driven)
 
 
 def test_embeddings_are_kept_where_they_are_asked_for():

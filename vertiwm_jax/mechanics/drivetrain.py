@@ -43,9 +43,9 @@ def actuate(
 
     Speed is controlled by a pedal in proportion to its error. A negative speed asks for the reverse
     gear, which is shifted to once the vehicle is nearly at rest; until then it brakes, and likewise
-    on the way back to a speed of zero or more. Differentials are open: all wheels
-    get the same torque, limited by power at their mean speed; the engine fades out over the upper
-    half of its speed range.
+    on the way back to a speed of zero or more. All driven wheels get the same torque, limited by
+    power at their mean speed; the engine fades out over the upper half of its speed range. Locked
+    differentials then bring wheels to one speed in `simulator`.
 
     Args:
         forward: `[]` m/s, speed of the vehicle.
@@ -60,9 +60,13 @@ def actuate(
     target = jnp.clip(command.steering, -vehicle.steering_limit, vehicle.steering_limit)
     turn = vehicle.steering_rate * seconds
     steering = steering + jnp.clip(target - steering, -turn, turn)
-    mean_speed = jnp.maximum(jnp.abs(jnp.mean(wheel_speed)), 1.0)
+    driven = vehicle.driven
+    mean_speed = jnp.mean(wheel_speed) if driven is None else wheel_speed @ driven / driven.sum()
+    mean_speed = jnp.maximum(jnp.abs(mean_speed), 1.0)
     torque = jnp.minimum(vehicle.wheel_torque, vehicle.wheel_power / mean_speed)
     torque = torque * jnp.clip(2 - 2 * mean_speed / vehicle.wheel_speed_limit, 0.0, 1.0)
+    if driven is not None:
+        torque = torque * driven
     brake = vehicle.brake_torque / (jnp.abs(wheel_speed) + SPIN_FLOOR)
     return Actuation(
         steering=steering,

@@ -49,6 +49,24 @@ class ContactForce(NamedTuple):
         return cls(arm, sum_of(force.direction.times(force.force) for force in forces), (x, y, z))
 
 
+class Shaft(NamedTuple):
+    """A spin that wheels `[C]` have in common; vectors are body components.
+
+    arm: of their contacts from the center of mass, m. pull: N s/rad, force on each contact per spin
+    gained, and torque about the shaft per velocity gained. inertia: `[]` kg m2 against which these
+    torques act within a step.
+    """
+
+    arm: Vector
+    pull: Vector
+    inertia: jax.Array
+
+    def gained(self, before: Twist, after: Twist, seconds: float) -> jax.Array:
+        """`[]` rad/s of spin, from the velocity that the contacts have gained."""
+        gained = velocity_at(after, self.arm).plus(velocity_at(before, self.arm), -1.0)
+        return seconds * jnp.sum(self.pull.dot(gained)) / self.inertia
+
+
 def velocity_at(twist: Twist, arm: Vector) -> Vector:
     """Velocity of body points `[C]` at `arm` from the center of mass, m/s."""
     return twist.linear.plus(twist.angular.cross(arm))
@@ -61,12 +79,14 @@ def advance_twist(
     gravity: Vector,
     contacts: list[ContactForce],
     seconds: float,
+    shaft: Shaft | None = None,
 ) -> Twist:
     """The body's twist after one linearly implicit Euler step, in the axes it had before.
 
     (M + dt sum_c J_c^T D_c J_c) dv = dt (f + sum_c J_c^T F_c), with J_c = [1, -r x]: the damping
     of every contact acts on the new velocity, so stiff springs and sticking friction are stable
-    at any step (Hairer and Wanner, Solving Ordinary Differential Equations II, sec. IV.7).
+    at any step (Hairer and Wanner, Solving Ordinary Differential Equations II, sec. IV.7). What a
+    shaft gains is eliminated: a matrix of rank one, sum_c J_c^T pull_c times itself, less.
 
     inertia: principal moments about the center of mass, kg m2; gravity: m/s2, body components.
     """
@@ -87,6 +107,12 @@ def advance_twist(
                 else:
                     damping = mixed[j][i - 3] if j < 3 else angular[j - 3][i - 3]
                 matrix[i][j] = matrix[i][j] + seconds * jnp.sum(damping, axis=-1)
+    if shaft is not None:
+        pulls = [jnp.sum(x, axis=-1) for x in (*shaft.pull, *shaft.arm.cross(shaft.pull))]
+        for i in range(6):
+            for j in range(i + 1):
+                gained = seconds**2 * pulls[i] * pulls[j] / shaft.inertia
+                matrix[i][j] = matrix[i][j] - gained
     change = _solve_spd(matrix, [seconds * r for r in rhs])
     linear, angular = Vector(*change[:3]), Vector(*change[3:])
     return Twist(twist.linear.plus(linear), twist.angular.plus(angular))

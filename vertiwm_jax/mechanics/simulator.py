@@ -20,6 +20,7 @@ from vertiwm_jax.mechanics.drivetrain import actuate
 from vertiwm_jax.mechanics.newton_euler import (
     ContactForce,
     DampedForce,
+    Shaft,
     Twist,
     advance_twist,
     applied,
@@ -219,8 +220,18 @@ def _substep(
     # Wheel spin is eliminated: traction is what is left of it once the spin has answered.
     inertia = vehicle.wheel_inertia + seconds * (driven.brake + radius**2 * grip)
     spin_up = seconds * (driven.torque - driven.brake * spin - ground.torque) / inertia
+    shaft, free = None, 1.0
+    if vehicle.locked is not None:
+        # Wheels on one shaft answer by its spin alone.
+        free = 1 - vehicle.locked
+        on_shaft = vehicle.locked * inertia
+        total = jnp.sum(on_shaft)
+        total = jnp.where(total > 0, total, 1.0)
+        common = jnp.sum(on_shaft * (spin + spin_up)) / total
+        spin_up = free * spin_up + vehicle.locked * (common - spin)
+        shaft = Shaft(arm, rolling.times(vehicle.locked * radius * grip), total)
     traction = ground.longitudinal + radius * grip * spin_up
-    traction_rate = grip * (1 - seconds * radius**2 * grip / inertia)
+    traction_rate = grip * (1 - free * seconds * radius**2 * grip / inertia)
 
     on_wheels = ContactForce.of(
         arm,
@@ -232,15 +243,21 @@ def _substep(
     gravity = Vector(axes.x.z, axes.y.z, axes.z.z).times(-GRAVITY)
     inertia_of_body = Vector.of(vehicle.inertia)
     twist = advance_twist(
-        body.twist, vehicle.mass, inertia_of_body, gravity, [on_wheels, on_hull], seconds
+        body.twist, vehicle.mass, inertia_of_body, gravity, [on_wheels, on_hull], seconds, shaft
     )
 
+    spin = spin + spin_up
+    of_wheels, of_hull = (applied(contact, body.twist, twist) for contact in (on_wheels, on_hull))
+    if shaft is not None and vehicle.locked is not None:
+        gained = shaft.gained(body.twist, twist, seconds)
+        spin = spin + vehicle.locked * gained
+        of_wheels = of_wheels.plus(shaft.pull, gained)
     gained = velocity_at(twist, arm).plus(velocity, -1.0)
     pushed = press.depth - sinkage - seconds * gained.dot(n)
     # The rear wheels find the front ones' ruts a wheelbase later, as far as they track them.
     fresh = 1 - jnp.exp(-seconds * jnp.abs(forward) / vehicle.wheelbase)
     history = SimulatorHistory(
-        wheel_speed=spin + spin_up + seconds * radius * grip * gained.dot(rolling) / inertia,
+        wheel_speed=spin + free * seconds * radius * grip * gained.dot(rolling) / inertia,
         travel=jnp.clip(
             press.droop + jnp.where(press.carrying, pushed / press.upright, 0.0),
             vehicle.free_travel - radius,
@@ -253,8 +270,7 @@ def _substep(
         wheels=wheels,
         force=jnp.stack([load, traction, ground.lateral], axis=-1),
     )
-    forces = (applied(contact, body.twist, twist) for contact in (on_wheels, on_hull))
-    of_wheels, of_hull = (axes.to_world(force).stacked() for force in forces)
+    of_wheels, of_hull = (axes.to_world(force).stacked() for force in (of_wheels, of_hull))
     on_ground = GroundForces(of_wheels, of_hull[0])
     return _advance_pose(vehicle, body, axes, center, twist, seconds), history, on_ground
 

@@ -1,8 +1,9 @@
 """A four-wheeled vehicle: masses, suspension, drivetrain, speed controller and limits."""
 
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -18,14 +19,15 @@ from vertiwm_jax.state import Command
 GRAVITY = 9.81
 HMMWV = "hmmwv"
 """Name of the default vehicle."""
+_AXLES = {"all": (1, 1, 1, 1), "rear": (0, 0, 1, 1), "front": (1, 1, 0, 0), "none": (0, 0, 0, 0)}
 
 
 @struct.dataclass
 class Vehicle:
-    """A vehicle with independent suspension and all-wheel drive; SI units, body axes.
+    """A vehicle with independent suspension; SI units, body axes.
 
     Wheels are front-left, front-right, rear-left, rear-right. The body origin lies between the
-    wheel centers of the design position. To the simulator, what is `[]` of a wheel may be `[4]`.
+    wheel centers of the design position. What is `[]` of a wheel may be `[4]`.
 
     mass: `[]` kg, wheels included.
     centre_of_mass: `[3]` m.
@@ -39,12 +41,17 @@ class Vehicle:
     free_travel: `[4]` m, wheel height in the body at which the spring is relaxed.
     steering_limit: `[]` rad; steering_rate: `[]` rad/s, both at the front wheels.
     speed_gain: `[]` s/m, pedal per speed error; full pedal is 1.
-    wheel_torque: `[]` N m a wheel at full throttle; wheel_power: `[]` W a wheel at most.
-    wheel_speed_limit: `[]` rad/s, mean wheel speed beyond which the engine gives nothing.
+    wheel_torque: `[]` N m a driven wheel at full throttle; wheel_power: `[]` W a driven wheel at
+        most.
+    wheel_speed_limit: `[]` rad/s, mean speed of the driven wheels beyond which the engine gives
+        nothing.
     brake_torque: `[]` N m a wheel at full braking.
     tyre_friction: `[]` the tire's own friction coefficient; contact takes the smaller one.
     hull: `[P, 3]` m, points of the chassis that touch the ground first, underside and roof.
     length, width: `[]` m, the rectangle that collides with obstacles, centered on the origin.
+    driven: `[4]`, 1 of wheels that the engine drives, else 0; None: it drives all.
+    locked: `[4]`, 1 of wheels that locked differentials bring to one speed, else 0; None: all
+        differentials are open.
     """
 
     mass: jax.Array
@@ -69,6 +76,8 @@ class Vehicle:
     hull: jax.Array
     length: jax.Array
     width: jax.Array
+    driven: jax.Array | None = None
+    locked: jax.Array | None = None
 
     @property
     def wheelbase(self) -> jax.Array:
@@ -77,13 +86,14 @@ class Vehicle:
 
     @property
     def track(self) -> jax.Array:
-        """`[]` m between left and right wheels."""
-        return self.wheel_position[0, 1] - self.wheel_position[1, 1]
+        """`[]` m between left and right wheels, the mean of both axles."""
+        left, right = self.wheel_position[0::2, 1], self.wheel_position[1::2, 1]
+        return (left - right).mean()
 
     @property
     def ride_height(self) -> jax.Array:
         """`[]` m from level ground to the body origin of a vehicle that stands on its springs."""
-        return self.wheel_radius - self.travel_at_rest.mean()
+        return self.wheel_radius.mean() - self.travel_at_rest.mean()
 
     @property
     def travel_at_rest(self) -> jax.Array:
@@ -107,6 +117,10 @@ class Vehicle:
         speed = (command.speed - low) / (high - low) * 2 - 1
         return jnp.clip(jnp.stack([speed, command.steering / self.steering_limit], -1), -1.0, 1.0)
 
+    def select(self, which: jax.Array) -> "Vehicle":
+        """One of stacked vehicles, by its number `[]`."""
+        return jax.tree.map(lambda leaf: leaf[which], self)
+
     def curvature(self, steering: jax.Array | np.ndarray) -> jax.Array:
         """`[...]` 1/m of the arcs driven at a steering in [-1, 1], left positive."""
         return jnp.tan(self.steering_limit * steering) / self.wheelbase
@@ -116,7 +130,8 @@ class Vehicle:
 class VehicleConfig:
     """The numbers of a vehicle in SI units, as in a file of `configs/vehicles`.
 
-    Axes and fields are those of `Vehicle`. Left and right are equal; pairs are front and rear.
+    Axes and fields are those of `Vehicle`. Left and right are equal; pairs are front and rear, and
+    one number stands for a pair of equals.
     """
 
     mass: Positive
@@ -127,11 +142,11 @@ class VehicleConfig:
     """kg m2, principal moments about the center of mass."""
     wheelbase: Positive
     """m between the axles."""
-    track: Positive
+    track: Positive | tuple[Positive, Positive]
     """m between left and right wheels."""
-    wheel_radius: Positive
+    wheel_radius: Positive | tuple[Positive, Positive]
     """m."""
-    wheel_width: Positive
+    wheel_width: Positive | tuple[Positive, Positive]
     """m."""
     wheel_inertia: Positive
     """kg m2 about the axle."""
@@ -150,11 +165,11 @@ class VehicleConfig:
     speed_gain: Positive
     """s/m, pedal per speed error; full pedal is 1."""
     wheel_torque: Positive
-    """N m a wheel at full throttle."""
+    """N m a driven wheel at full throttle."""
     wheel_power: Positive
-    """W a wheel at most."""
+    """W a driven wheel at most."""
     wheel_speed_limit: Positive
-    """rad/s, mean wheel speed beyond which the engine gives nothing."""
+    """rad/s, mean speed of the driven wheels beyond which the engine gives nothing."""
     brake_torque: Positive
     """N m a wheel at full braking."""
     tyre_friction: Positive
@@ -165,12 +180,16 @@ class VehicleConfig:
     """m, of the rectangle that collides with obstacles."""
     width: Positive
     """m, of that rectangle."""
+    drive: Literal["all", "rear", "front"] = "all"
+    """The axles whose wheels the engine drives."""
+    locked: Literal["none", "rear", "front", "all"] = "none"
+    """The axles whose wheels locked differentials bring to one speed; others have open ones."""
     scale: Positive = 1.0
     """The factor to HMMWV size: 10 for a 1/10-scale rover."""
 
     def check(self) -> None:
         for name, value in vars(self).items():
-            if not np.isfinite(value).all():
+            if not isinstance(value, str) and not np.isfinite(value).all():
                 raise ValueError(f"{name}: expected finite numbers, found {value}")
         x, y, belly, roof = self.hull
         if not (x > 0 and y > 0 and belly < roof):
@@ -180,20 +199,45 @@ class VehicleConfig:
         if third > first + second:
             expected = "no moment larger than the sum of both others"
             raise ValueError(f"inertia: expected {expected}, found {self.inertia}")
+        if self.drive != "all" and self.locked not in ("none", self.drive):
+            expected = f"none or {self.drive}, as these wheels are driven"
+            raise ValueError(f"locked: expected {expected}, found {self.locked!r}")
 
     @property
     def vehicle(self) -> Vehicle:
         """At full size, by Froude's similarity; NumPy float32 leaves, which start no device."""
-        x, y = self.wheelbase / 2, self.track / 2
+        x, y = self.wheelbase / 2, np.broadcast_to(self.track, 2) / 2
         values: dict[str, Any] = dict(vars(self))
+        for name in ("wheel_radius", "wheel_width", "spring", "damper", "free_travel"):
+            if isinstance(values[name], tuple):
+                values[name] = np.repeat(values[name], 2)
         values |= {
-            "wheel_position": [(x, y), (x, -y), (-x, y), (-x, -y)],
+            "wheel_position": [(x, y[0]), (x, -y[0]), (-x, y[1]), (-x, -y[1])],
             "hull": _box(*self.hull),
-            **{name: np.repeat(values[name], 2) for name in ("spring", "damper", "free_travel")},
+            "driven": None if self.drive == "all" else _AXLES[self.drive],
+            "locked": None if self.locked == "none" else _AXLES[self.locked],
         }
-        arrays = {field.name: np.asarray(values[field.name], float) for field in fields(Vehicle)}
-        large = froude.scaled(Vehicle(**cast(dict[str, jax.Array], arrays)), self.scale)
+        arrays = {
+            field.name: None
+            if values[field.name] is None
+            else np.asarray(values[field.name], float)
+            for field in fields(Vehicle)
+        }
+        large = froude.scaled(Vehicle(**cast(dict[str, Any], arrays)), self.scale)
         return jax.tree.map(lambda x: np.asarray(x, np.float32), large)
+
+
+def stack(vehicles: Sequence[Vehicle]) -> Vehicle:
+    """Vehicles of any layouts as one with leaves `[N, ...]`, for `select`."""
+    every = [vars(vehicle) for vehicle in vehicles]
+    leaves: dict[str, Any] = {}
+    for name in every[0]:
+        absent = _AXLES["all" if name == "driven" else "none"]
+        given = [numbers[name] for numbers in every]
+        if any(x is not None for x in given):
+            filled = [np.array(absent, np.float32) if x is None else x for x in given]
+            leaves[name] = np.stack(np.broadcast_arrays(*filled))
+    return Vehicle(**leaves)
 
 
 def load(name: str) -> VehicleConfig:

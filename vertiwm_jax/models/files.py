@@ -1,5 +1,6 @@
 """Fitted models on disk: a folder with the weights and what they are of."""
 
+from dataclasses import fields, replace
 from pathlib import Path
 
 import jax
@@ -7,7 +8,7 @@ import jax
 from vertiwm_jax import checkpoints
 from vertiwm_jax import config as configuration
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import load_vehicle
+from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
 from vertiwm_jax.models.config import ModelConfig
 from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
@@ -35,4 +36,9 @@ def load(folder: Path) -> tuple[ModelConfig, VertiWMParams]:
     like = jax.eval_shape(
         lambda key: config.init_params(key, chrono_like(load_vehicle())), jax.random.key(0)
     )
+    # Of wheels, a vehicle has one number or four, and some have no numbers of their layout.
+    found = checkpoints.outline(path)
+    names = {field.name: f"vehicle.{field.name}" for field in fields(Vehicle)}
+    own = {field: found[name] for field, name in names.items() if name in found}
+    like = replace(like, vehicle=replace(like.vehicle, **own))
     return config, checkpoints.load(path, like)

@@ -111,8 +111,8 @@ def under_wheels(
 ) -> tuple[jax.Array, jax.Array]:
     """Ground class `[4]` uint8 under wheels, and how deep they reach below the map `[4]`, m.
 
-    center: `[4, 3]` of the wheels, world frame, m; radius: `[]` m. The depth is along the normal
-    of the undeformed ground, as in the recorded drives; negative in the air.
+    center: `[4, 3]` of the wheels, world frame, m; radius: `[]` or `[4]` m. The depth is along the
+    normal of the undeformed ground, as in the recorded drives; negative in the air.
     """
     around = _TYRE * jnp.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], jnp.float32)
     ground = query.surface(terrain, center[:, None, :2] + around)

@@ -114,9 +114,9 @@ def _draw_map(axes: Axes, scene: Scene) -> Show:
         corner = middle - length / 2, -width / 2
         return axes.add_patch(Rectangle(corner, length, width, zorder=3, **style))
 
-    length, width = float(vehicle.length), float(vehicle.track - vehicle.wheel_width)
-    tire = 2 * float(vehicle.wheel_radius), float(vehicle.wheel_width)
-    wheels = [box(*tire, facecolor="black") for _ in range(4)]
+    length, width = float(vehicle.length), float(vehicle.track - np.max(vehicle.wheel_width))
+    tires = np.stack(np.broadcast_arrays(2 * vehicle.wheel_radius, vehicle.wheel_width, [0.0] * 4))
+    wheels = [box(*tire, facecolor="black") for tire in tires[:2].T.tolist()]
     body = (
         box(length, width, facecolor=_DRIVEN, edgecolor="white"),
         box(0.4 * length, 0.8 * width, -0.05 * length, facecolor="white", alpha=0.7),

@@ -92,22 +92,23 @@ def _vehicle(stream: rr.RecordingStream, scene: Scene) -> None:
     heights = np.asarray(vehicle.hull)[:, 2]
     low, high = heights.min(), heights.max()
     waist = (low + high) / 2
-    length, width = float(vehicle.length), float(vehicle.track - vehicle.wheel_width)
+    length, width = float(vehicle.length), float(vehicle.track - np.max(vehicle.wheel_width))
     # The cabin is at the rear, so that this can be told from the front.
     hull = _boxes([[0, 0, (low + waist) / 2]], [[length, width, waist - low]], DRIVEN)
     cabin = [[-0.175 * length, 0, (waist + high) / 2]], [[0.65 * length, width, high - waist]]
     _still(stream, "world/vehicle/body", hull)
     _still(stream, "world/vehicle/cabin", _boxes(*cabin, _CABIN))
-    radius, width = float(vehicle.wheel_radius), float(vehicle.wheel_width)
-    tire = rr.Cylinders3D(
-        lengths=width,
-        radii=radius,
-        rotation_axis_angles=rr.RotationAxisAngle(axis=[1, 0, 0], radians=np.pi / 2),
-        colors=_rgb(_TIRE),
-        fill_mode="solid",
-    )
-    spoke = _boxes([[0, 0, 0]], [[1.5 * radius, 1.04 * width, 0.2 * radius]], _SPOKE)
+    radii, widths = (np.broadcast_to(x, 4) for x in (vehicle.wheel_radius, vehicle.wheel_width))
     for i, name in enumerate(WHEELS):
+        radius, width = float(radii[i]), float(widths[i])
+        tire = rr.Cylinders3D(
+            lengths=width,
+            radii=radius,
+            rotation_axis_angles=rr.RotationAxisAngle(axis=[1, 0, 0], radians=np.pi / 2),
+            colors=_rgb(_TIRE),
+            fill_mode="solid",
+        )
+        spoke = _boxes([[0, 0, 0]], [[1.5 * radius, 1.04 * width, 0.2 * radius]], _SPOKE)
         entity = _entity("world", "vehicle", "wheels", name)
         turned, steered = scene.turned[:, i], scene.steering[:, i]
         rpy = np.stack([np.zeros_like(turned), turned, steered], axis=1)
