@@ -108,7 +108,7 @@ def test_samples_that_cannot_be_used_are_left_out_and_said(arrays, field):
     (remark,) = log.remarks
     assert re.match(f"a.csv: {WRONG[field][1]}", remark)
     assert "in sample 5 among 2 such" in remark and log.remarks[remark] == 2
-    assert remark.endswith(f"{arrays['time'][4]:.10g} and {arrays['time'][6]:.10g}: left out")
+    assert remark.endswith(f"{arrays['time'][4]:.13g} and {arrays['time'][6]:.13g}: left out")
 
 
 @pytest.mark.parametrize("field", WRONG)
@@ -143,7 +143,7 @@ def test_a_clock_that_is_set_back_cuts_the_log(arrays):
     for log in logs:
         assert_same(log, read(arrays))
     assert len(logs) == 2
-    said = f"is set back from {arrays['time'][-1]:.10g} to {arrays['time'][0]:.10g}"
+    said = f"is set back from {arrays['time'][-1]:.13g} to {arrays['time'][0]:.13g}"
     assert [said in remark for remark in logs[0].remarks] == [True, True]
     with pytest.raises(DataError, match=r"expected clocks .* set back together, found 1 and 0"):
         converted(Log(**twice | {k: arrays[k] for k in ("command_time", "command")}), "a", SETTINGS)

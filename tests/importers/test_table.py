@@ -13,7 +13,7 @@ from pyarrow import parquet
 from vertiwm_jax import config
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.importers import table
-from vertiwm_jax.importers.settings import ImportSettings, Table
+from vertiwm_jax.importers.settings import ImportSettings, Table, Units
 from vertiwm_jax.learning.schema import DataError
 
 NAMES = ["t", "x", "y", "z", "roll", "pitch", "yaw", "speed", "steer"]
@@ -88,6 +88,26 @@ def test_parquet_of_nedm(seen, tmp_path):
         np.testing.assert_allclose(log.velocity, seen.state[:, 6:9], atol=1e-6)
         np.testing.assert_allclose(log.angular_velocity, seen.state[:, 9:12], atol=1e-6)
         np.testing.assert_allclose(log.command, [[3.0, 0.5 * 0.3725]] * len(log.time), rtol=1e-6)
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_other_separators(seen, tmp_path, separator):
+    path = write(tmp_path / "a.csv", NAMES, rows(seen))
+    (expected,) = table.read(path, CSV)
+    path.write_text(path.read_text().replace(",", separator))
+    (log,) = table.read(path, CSV)
+    np.testing.assert_array_equal(log.position, expected.position)
+
+
+@pytest.mark.parametrize("unit", ["ms", "ns"])
+def test_dates_have_units_of_their_own(seen, tmp_path, unit):
+    columns = dict(zip(NAMES, np.array(rows(seen), float).T, strict=True))
+    stamps = (1e3 * columns["t"]).round().astype("datetime64[ms]").astype(f"datetime64[{unit}]")
+    stamps[3] = np.datetime64("NaT", unit)
+    path = tmp_path / "a.parquet"
+    parquet.write_table(pyarrow.table(columns | {"t": stamps}), path)
+    (log,) = table.read(path, replace(CSV, units=Units(time=1e-3)))
+    np.testing.assert_allclose(log.time, np.delete(seen.time, 3), atol=1e-3)
 
 
 def test_drives_come_in_the_order_in_which_they_begin(seen, tmp_path):

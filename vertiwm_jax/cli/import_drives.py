@@ -27,5 +27,9 @@ class ImportDrives:
 def run(name: str, words: list[str]) -> None:
     command = arguments.read(ImportDrives, name, words)
     print(import_drives(command.sources, command.output, command.settings, map=command.map))
-    print(f"the drives are in {command.output}; to fit the world model to them:")
+    print(
+        f"the drives are in {command.output}; to predict them, beside your vehicle if you give its"
+    )
+    print("file (--vehicle, an HMMWV by default), and to fit the world model to them:")
+    print(f"python -m vertiwm_jax.evaluate prediction --data {command.output}")
     print(f"python -m vertiwm_jax.fit --data {command.output}")

@@ -219,7 +219,7 @@ def _import(
         for why, moments in others.items():
             if why not in left_out:
                 first = min(moments) / (scale**0.5 * settings.units.time)
-                remarks.append(f"{log.name}: from {first:.10g} on: {why}")
+                remarks.append(f"{log.name}: from {first:.13g} on: {why}")
             left_out[why] += len(moments)
     if 2 * len(refused) > len(logs):
         raise DataError(refused[0])

@@ -148,7 +148,7 @@ def _usable(
         if 2 * len(samples) > len(stamps):
             raise DataError(found)
         before, after = stamps[max(first - 1, 0)], stamps[min(first + 1, last)]
-        said[f"{found}, between {before:.10g} and {after:.10g}: left out"] = len(samples)
+        said[f"{found}, between {before:.13g} and {after:.13g}: left out"] = len(samples)
 
     for quantity in fields:
         values = getattr(log, quantity)
@@ -167,7 +167,7 @@ def _usable(
     fallen = np.flatnonzero(np.diff(time) < -gap) + 1
     back = [i for i in fallen if i + 1 < len(time) and time[i + 1] <= time[i - 1]]
     for i in back:
-        said[f"{called(fields[0])} is set back from {time[i - 1]:.10g} to {time[i]:.10g}"] = 0
+        said[f"{called(fields[0])} is set back from {time[i - 1]:.13g} to {time[i]:.13g}"] = 0
     parts = np.split(number, back)
     late = np.zeros(len(stamps), bool)
     for part in parts:

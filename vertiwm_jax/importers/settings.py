@@ -110,7 +110,7 @@ class Table:
     """Names of the columns of a CSV or Parquet file with one row per time stamp."""
 
     time: str
-    """Time stamp of the row."""
+    """Time stamp of the row: a number in `units.time`, or a date in Parquet."""
     position: Names | tuple[str, str]
     """x, y, z; or x, y, with `yaw`."""
     speed: str | None = None

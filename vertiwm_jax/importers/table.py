@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,11 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
         raise DataError(f"{path}: expected settings with a section `table` that names its columns")
     columns_of = _parquet_columns if path.suffix == ".parquet" else _csv_columns
     columns, remarks = columns_of(path, _names(table))
+    stamps = columns[table.time]
+    if stamps.dtype.kind == "M":  # Dates, which have a unit of their own.
+        nanoseconds = stamps.astype("datetime64[ns]").astype(np.int64)
+        seconds = np.where(np.isnat(stamps), np.nan, 1e-9 * nanoseconds)
+        columns[table.time] = seconds / settings.units.time
     if table.drive is None:
         return converted(_log(str(path), columns, table), path, settings, remarks.items())
     drives = columns.pop(table.drive).astype(str)
@@ -47,13 +53,18 @@ def read(path: Path, settings: ImportSettings) -> list[Log]:
 
 
 def _csv_columns(path: Path, names: Sequence[str]) -> tuple[Columns, dict[str, int]]:
-    """Columns of a CSV file with a header line, as text, and what is said of its other lines."""
+    """Columns of a CSV file with a header line, as text, and what is said of its other lines.
+
+    Commas, semicolons or tabs separate values: what the header line has most of.
+    """
     cells, others = [], []
     with (
         refusing(lambda found: DataError(f"{path}: expected a CSV file in UTF-8: {found}")),
         path.open(newline="", encoding="utf-8-sig") as file,
     ):
-        rows = csv.reader(file, skipinitialspace=True)
+        first = file.readline()
+        separator = max(",;\t", key=first.count)
+        rows = csv.reader(chain([first], file), delimiter=separator, skipinitialspace=True)
         head = next(rows, [])
         _check_head(path, names, head)
         places = [head.index(name) for name in names]
