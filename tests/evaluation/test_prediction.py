@@ -2,21 +2,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import chex
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.evaluation import error_sources, prediction
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.dataset import Drives, WheelSignals
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.learning.windows import Windows
-from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
+from vertiwm_jax.mechanics.kinematic import (
+    ConstantVelocity,
+    KinematicBicycle,
+    bicycle_of,
+    place,
+)
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
-from vertiwm_jax.mechanics.vehicle import load_vehicle
-from vertiwm_jax.state import VehicleState
+from vertiwm_jax.mechanics.vehicle import load, load_vehicle, stack
+from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -274,3 +281,29 @@ def test_predictions_are_of_the_selected_worlds():
     final = prediction.predict(KinematicBicycle(), bicycle_of(load_vehicle()), test).states
     assert float(final.rpy[0, -1, 1]) == pytest.approx(0.0, abs=1e-6)
     assert float(final.rpy[1, -1, 1]) == pytest.approx(-np.arctan(0.2), abs=1e-4)
+
+
+@pytest.mark.integration
+def test_every_world_is_predicted_with_its_own_vehicle():
+    """Two vehicles accelerate and turn on worlds of their own; each is its own best model."""
+    configs = load("hmmwv"), replace(load("hmmwv"), mass=5e3, drive="rear", wheel_torque=2e3)
+    terrain, steps = terrain_map.stack([GROUND, GROUND]), CONTEXT + HORIZON
+    control = jnp.broadcast_to(jnp.array([4.0, 0.2]), (steps, 2))
+    commands, states = Command.from_vector(control), []
+    for config in configs:
+        params = chrono_like(config.vehicle)
+        start = place(GROUND, vehicle=params.vehicle, speed=1.0)
+        driven = rollout(Simulator(), params, GROUND, start, commands)
+        states.append(jnp.concatenate([start.vector[None], driven.vector]))
+    world = jnp.arange(2)
+    recorded = Windows(jnp.stack(states), jnp.stack([control] * 2), world, 0 * world, CONTEXT)
+    test = TestWindows(recorded, np.arange(2), terrain)
+
+    def errors(*order):
+        vehicles = stack([configs[i].vehicle for i in order])
+        params = jax.vmap(chrono_like)(vehicles)
+        found = prediction.predict(Simulator(), params, test, by_world=True).states
+        return prediction.absolute_errors(found, test)[0]["position"][:, -1]
+
+    assert errors(0, 1).max() < 2e-3
+    assert errors(1, 0).min() > 0.1

@@ -12,6 +12,7 @@ from vertiwm_jax.learning import dataset, pipeline
 from vertiwm_jax.learning.dataset import Collection, SplitConfig
 from vertiwm_jax.learning.pipeline import KINDS, PipelineConfig
 from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
 from vertiwm_jax.terrain.map import MapError, TerrainMap
@@ -310,11 +311,39 @@ def test_collections_of_other_classes_are_refused(tmp_path):
 
 def test_vehicles_are_named_as_the_files_say(tmp_path):
     said = [{"name": "uaz", "model": "UAZBUS"}, {"model": "HMMWV_Reduced"}, {}, None]
-    for i, vehicle in enumerate(said):
-        meta = {"map": "hill.npz"} | ({} if vehicle is None else {"vehicle": vehicle})
+    for i, facts in enumerate(said):
+        meta = {"map": "hill.npz"} | ({} if facts is None else {"vehicle": facts})
         write(tmp_path, f"{i}.npz", meta=np.array(json.dumps(meta)))
     loaded, _ = dataset.load_drives(tmp_path, "test")
     assert loaded.vehicles == ("uaz", "HMMWV_Reduced", "unnamed", "unnamed")
+
+
+def test_each_world_has_the_vehicle_that_its_file_describes(tmp_path):
+    wheel = [[1.2, 0.7], [1.2, -0.7], [-1.2, 0.7], [-1.2, -0.7]]
+    facts = {
+        **{"name": "van", "mass": 2800.0, "inertia": np.diag([900.0, 3000.0, 3400.0]).tolist()},
+        **{"com_in_body": [0.0, 0.0, 0.2], "wheels_in_body_xy": wheel, "wheel_radius": 0.37},
+        **{"wheel_width": 0.2, "wheel_height_at_rest": [0.01] * 4, "pedal_gain": 1.0},
+        "wheel_load_at_rest": [6867.0] * 4,
+        "front_angle": {"0.5": 0.2, "1.0": 0.4, "-0.5": -0.2, "-1.0": -0.4},
+        "bench": {"start": [0.5, 1.1, 1.6, 2.1, 2.5], "stop": [2.0, 1.5, 1.0, 0.5, 0.0]},
+    }
+    for name, said in (("a", facts), ("b", {"name": "van"})):
+        meta = np.array(json.dumps({"map": "hill.npz", "vehicle": said}))
+        write(tmp_path, f"{name}.npz", meta=meta)
+    loaded, terrain = dataset.load_drives(tmp_path, "test")
+    driven = loaded.driven(vehicle.load("hmmwv"))
+    assert driven.mass.shape == (terrain.worlds,)
+    np.testing.assert_allclose(driven.mass, [2800.0, 2493.6])
+    own = driven.select(loaded.world[0])
+    np.testing.assert_allclose(own.wheel_position, wheel, atol=1e-6)
+    assert loaded.described[1] is None
+
+    meta = np.array(json.dumps({"map": "hill.npz", "vehicle": facts | {"mass": 0.0}}))
+    path = write(tmp_path, "c.npz", meta=meta)
+    with pytest.raises(ConfigError, match=r"mass: expected more than 0, found 0\.0") as refused:
+        dataset.load_drives(tmp_path, "test")
+    assert str(refused.value).startswith(f"{path}: meta.vehicle: mass: ")
 
 
 def test_worlds_that_are_left_out_are_only_to_test(tmp_path):

@@ -327,6 +327,18 @@ def test_the_engine_drives_the_wheels_of_its_axle_alone(drive_of, driven):
     assert (pull[driven] > 100).all() and (np.delete(pull, driven) < 1).all()
 
 
+@pytest.mark.parametrize(("command", "wheels"), [(0.18, 0.225), (0.36, 0.36), (-0.18, -0.225)])
+def test_front_wheels_turn_as_their_steering_does(command, wheels):
+    """As ones without a law of their own do that are told the angle."""
+    flat, own = ground(), replace(load("hmmwv"), steering_limit=0.36)
+    law, none = (chrono_like(x.vehicle) for x in (replace(own, wheel_angle=(1.25, 1.0)), own))
+    found, expected = (
+        drive(flat, at_rest(flat), 2.0, angle, params).state.angular_velocity[-1, 2]
+        for angle, params in ((command, law), (wheels, none))
+    )
+    assert found == pytest.approx(expected, rel=2e-3)
+
+
 def test_a_locked_vehicle_pulls_with_the_wheels_that_have_grip():
     """On a slope, with ice below the rear wheels: one that is open spins there and slides back."""
     friction = np.tile(np.where(np.arange(64) < 32, 0.02, 0.8), (64, 1))

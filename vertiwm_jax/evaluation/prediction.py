@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple, Self
 
 import jax
@@ -188,22 +189,27 @@ class Predicted(NamedTuple):
         return jax.tree.map(lambda x: x[rows, :steps], self)
 
 
-def predict(dynamics: Dynamics, params: Params, test: TestWindows) -> Predicted:
+def predict(
+    dynamics: Dynamics, params: Params, test: TestWindows, by_world: bool = False
+) -> Predicted:
     """Predicts every window open-loop; the results are in host memory.
+
+    by_world: whether each world has parameters of its own, leaves `[W, ...]`.
 
     The history is warmed up on the recorded context. From its last state on, the model sees its own
     predictions and the recorded commands (the paper's protocol, Sec. V-A).
     """
-    return jax.device_get(_predict(dynamics, params, test.terrain, test.windows))
+    return jax.device_get(_predict(dynamics, params, test.terrain, test.windows, by_world))
 
 
-@partial(jax.jit, static_argnames="dynamics")
+@partial(jax.jit, static_argnames=("dynamics", "by_world"))
 def _predict(
-    dynamics: Dynamics, params: Params, terrain: TerrainMap, windows: Windows
+    dynamics: Dynamics, params: Params, terrain: TerrainMap, windows: Windows, by_world: bool
 ) -> Predicted:
     def one(window: Windows) -> Predicted:
         ground = terrain.select(window.world)
-        return Predicted(*open_loop(dynamics, params, ground, window, Reading.of))
+        own = jax.tree.map(itemgetter(window.world), params) if by_world else params
+        return Predicted(*open_loop(dynamics, own, ground, window, Reading.of))
 
     return jax.lax.map(one, windows, batch_size=BATCH)
 

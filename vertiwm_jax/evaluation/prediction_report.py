@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import jax
 import numpy as np
 
 from vertiwm_jax import atomic
@@ -19,6 +21,7 @@ from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.dataset import Collection, SplitConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
+from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.models.config import SoilSource
 from vertiwm_jax.models.registry import ModelName, load_fitted, load_model
 from vertiwm_jax.runs import Progress
@@ -48,9 +51,9 @@ class PredictionTest:
     """The models."""
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
-    vehicle: str = vehicle.HMMWV
-    """What the built-in simulator and the bicycle drive: the name of a shipped vehicle, or
-    a YAML file of one."""
+    vehicle: str | None = None
+    """What the built-in simulator and the bicycle drive: the name of a shipped vehicle, or a YAML
+    file of one; by default the vehicle that each file of drives describes, or else the HMMWV."""
     soil: SoilSource | None = None
     """Where the models have soils from, if not from where they had them when they were fitted."""
     compare: tuple[Path, ...] = ()
@@ -81,22 +84,29 @@ class PredictionTest:
         for collection in collections:
             _log.info("%s; predicted: %s", collection, split)
         dataset.expect_drives(collections, split, self.context + max(self.horizons))
-        driven = vehicle.load(self.vehicle).vehicle
+        given = vehicle.load(self.vehicle or vehicle.HMMWV)
         models: dict[str, tuple[Dynamics, Params]] = {
-            name: load_model(name, self.weights, vehicle=driven, soil=self.soil)
+            name: load_model(name, self.weights, soil=self.soil)
             for name in dict.fromkeys((*self.models, "builtin"))
         }
         for folder in self.compare:
             fitted = load_fitted(folder / "model")
             models |= {f"{folder.name}: {part}": model for part, model in fitted.items()}
-        models["kinematic bicycle"] = KinematicBicycle(), bicycle_of(driven)
-        models["constant velocity"] = ConstantVelocity(), None
         drives, terrain = dataset.load_drives(self.data, split, self.splits)
+        if self.vehicle:
+            drives = replace(drives, described=(None,) * terrain.worlds)
+        driven = drives.driven(given)
+        own = {
+            "builtin": (Simulator(), jax.vmap(chrono_like)(driven)),
+            "kinematic bicycle": (KinematicBicycle(), jax.vmap(bicycle_of)(driven)),
+        }
+        models |= own
+        models["constant velocity"] = ConstantVelocity(), None
         every, tests = TestWindows.nested(drives, terrain, self.context, self.horizons, self.stride)
         predicted = {}
         with Progress(len(models), "models") as progress:
             for name, model in models.items():
-                predicted[name] = prediction.predict(*model, every)
+                predicted[name] = prediction.predict(*model, every, by_world=name in own)
                 progress.advance(1, f"{name}, {len(every.drive):,} windows")
         found, tables = [], []
         for steps, (rows, test) in tests.items():

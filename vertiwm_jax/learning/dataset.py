@@ -17,6 +17,9 @@ from vertiwm_jax import geometry
 from vertiwm_jax.config import Share, settings
 from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.schema import SPLITS, DataError
+from vertiwm_jax.mechanics import vehicle
+from vertiwm_jax.mechanics.measured import is_described, measured
+from vertiwm_jax.mechanics.vehicle import Vehicle, VehicleConfig
 from vertiwm_jax.precision import float32
 from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain.map import TerrainMap, stack
@@ -70,7 +73,8 @@ class Drives:
     state: `[D, T + 1, 12]` float32; control: `[D, T, 2]` float32; length: `[D]` valid steps, later
     values have no meaning; wheel_class: `[D, T + 1, 4]` uint8; world: `[D]` index into
     the terrain map; wheels: leaves `[D, T + 1, ...]` float32; vehicles: by world, the name of the
-    vehicle that drove there, static.
+    vehicle that drove there, static; described: by world, that vehicle where its file describes it,
+    static.
     """
 
     state: Array
@@ -80,6 +84,14 @@ class Drives:
     world: Array
     wheels: WheelSignals
     vehicles: tuple[str, ...] = struct.field(default=(), pytree_node=False)
+    described: tuple[VehicleConfig | None, ...] = struct.field(default=(), pytree_node=False)
+
+    def driven(self, otherwise: VehicleConfig) -> Vehicle:
+        """The vehicles that drove, leaves `[W, ...]`, to `select` by world.
+
+        otherwise: where a file describes none.
+        """
+        return vehicle.stack([(own or otherwise).vehicle for own in self.described])
 
 
 @settings
@@ -312,4 +324,14 @@ def _join(paths: list[Path], parts: list[dict[str, np.ndarray]]) -> Drives:
     signals = WheelSignals(
         **{name: joined.pop(name) for name in schema.WHEEL_SIGNALS if name in joined}
     )
-    return Drives(**joined, wheels=signals, vehicles=tuple(map(schema.vehicle_name, paths)))
+    facts = [schema.vehicle_facts(path) for path in paths]
+    described = (
+        measured(own, f"{path}: meta.vehicle") if is_described(own) else None
+        for path, own in zip(paths, facts, strict=True)
+    )
+    return Drives(
+        **joined,
+        wheels=signals,
+        vehicles=tuple(map(schema.vehicle_name, facts)),
+        described=tuple(described),
+    )

@@ -6,7 +6,8 @@ A collection is a folder of `.npz` files, one a world, each with K drives of T s
     control        [K, T, 2]         commanded speed m/s, front-wheel angle rad, from t to t + 1
     length         [K]               valid steps of each drive
     meta           text              JSON with "map", the file name of the terrain map; may have
-                                     "vehicle": {"name": ...}
+                                     "vehicle": {"name": ...}, and describe the vehicle there
+                                     (`mechanics.measured`)
 
 and, as far as they were recorded (wheels in the order FL, FR, RL, RR),
 
@@ -133,11 +134,15 @@ def _stored(path: Path, names: Sequence[str], required: Sequence[str]) -> dict[s
     return found
 
 
-def vehicle_name(path: Path) -> str:
-    """What a file, which can be read, calls its vehicle by name or model; or else `UNNAMED`."""
+def vehicle_facts(path: Path) -> dict[str, Any]:
+    """What a file, which can be read, says of its vehicle; see `mechanics.measured`."""
     vehicle = json.loads(str(load_archive(path, ("meta",))["meta"])).get("vehicle")
-    said = vehicle if isinstance(vehicle, dict) else {}
-    return str(said.get("name") or said.get("model") or UNNAMED)
+    return vehicle if isinstance(vehicle, dict) else {}
+
+
+def vehicle_name(facts: Mapping[str, Any]) -> str:
+    """What a file calls its vehicle by name or model; or else `UNNAMED`."""
+    return str(facts.get("name") or facts.get("model") or UNNAMED)
 
 
 def drive(state: np.ndarray, control: np.ndarray, **others: np.ndarray) -> dict[str, np.ndarray]:

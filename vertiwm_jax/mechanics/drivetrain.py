@@ -60,6 +60,11 @@ def actuate(
     target = jnp.clip(command.steering, -vehicle.steering_limit, vehicle.steering_limit)
     turn = vehicle.steering_rate * seconds
     steering = steering + jnp.clip(target - steering, -turn, turn)
+    angle = steering
+    if vehicle.wheel_angle is not None:
+        half, full = vehicle.wheel_angle
+        share = jnp.abs(steering) / vehicle.steering_limit
+        angle = steering * (half + (full - half) * (2 * share - 1))
     driven = vehicle.driven
     mean_speed = jnp.mean(wheel_speed) if driven is None else wheel_speed @ driven / driven.sum()
     mean_speed = jnp.maximum(jnp.abs(mean_speed), 1.0)
@@ -70,7 +75,7 @@ def actuate(
     brake = vehicle.brake_torque / (jnp.abs(wheel_speed) + SPIN_FLOOR)
     return Actuation(
         steering=steering,
-        angle=jnp.concatenate([jnp.full(2, steering), jnp.zeros(2)]),
+        angle=jnp.concatenate([jnp.full(2, angle), jnp.zeros(2)]),
         gear=gear,
         torque=gear * jnp.maximum(pedal, 0.0) * torque,
         brake=jnp.maximum(-pedal, 0.0) * brake,

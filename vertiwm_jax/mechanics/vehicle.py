@@ -52,6 +52,8 @@ class Vehicle:
     driven: `[4]`, 1 of wheels that the engine drives, else 0; None: it drives all.
     locked: `[4]`, 1 of wheels that locked differentials bring to one speed, else 0; None: all
         differentials are open.
+    wheel_angle: `[2]`, angle of the front wheels as a share of the commanded one, at half and at
+        full lock, linear in the angle; None: they turn as commanded.
     """
 
     mass: jax.Array
@@ -78,6 +80,7 @@ class Vehicle:
     width: jax.Array
     driven: jax.Array | None = None
     locked: jax.Array | None = None
+    wheel_angle: jax.Array | None = None
 
     @property
     def wheelbase(self) -> jax.Array:
@@ -184,6 +187,8 @@ class VehicleConfig:
     """The axles whose wheels the engine drives."""
     locked: Literal["none", "rear", "front", "all"] = "none"
     """The axles whose wheels locked differentials bring to one speed; others have open ones."""
+    wheel_angle: tuple[Positive, Positive] = (1.0, 1.0)
+    """Angle of the front wheels as a share of the commanded one, at half and at full lock."""
     scale: Positive = 1.0
     """The factor to HMMWV size: 10 for a 1/10-scale rover."""
 
@@ -216,6 +221,7 @@ class VehicleConfig:
             "hull": _box(*self.hull),
             "driven": None if self.drive == "all" else _AXLES[self.drive],
             "locked": None if self.locked == "none" else _AXLES[self.locked],
+            "wheel_angle": None if self.wheel_angle == (1, 1) else self.wheel_angle,
         }
         arrays = {
             field.name: None
@@ -230,12 +236,12 @@ class VehicleConfig:
 def stack(vehicles: Sequence[Vehicle]) -> Vehicle:
     """Vehicles of any layouts as one with leaves `[N, ...]`, for `select`."""
     every = [vars(vehicle) for vehicle in vehicles]
+    plain = {"driven": _AXLES["all"], "locked": _AXLES["none"], "wheel_angle": (1, 1)}
     leaves: dict[str, Any] = {}
     for name in every[0]:
-        absent = _AXLES["all" if name == "driven" else "none"]
         given = [numbers[name] for numbers in every]
         if any(x is not None for x in given):
-            filled = [np.array(absent, np.float32) if x is None else x for x in given]
+            filled = [np.array(plain[name], np.float32) if x is None else x for x in given]
             leaves[name] = np.stack(np.broadcast_arrays(*filled))
     return Vehicle(**leaves)
 
