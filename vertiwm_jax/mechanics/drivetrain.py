@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle
+from vertiwm_jax.mechanics.vehicle import GRAVITY, Skid, Vehicle
 from vertiwm_jax.state import Command
 
 SHIFT_FROUDE = 0.21
@@ -17,13 +17,16 @@ SPIN_FLOOR = 0.5
 class Actuation(NamedTuple):
     """Inputs of the wheels.
 
-    steering: `[]` rad of the front wheels, as far as they have turned. angle: `[4]` rad of each.
+    steering: `[]` rad of the front wheels, as far as they have turned, or rad/s of yaw that the
+        sides of a skid-steered vehicle are driven to; speed: `[]` m/s that they are, else None.
+    angle: `[4]` rad of each wheel.
     gear: `[]` 1 forward, -1 reverse.
     torque: N m on each wheel, `[]` or `[4]`.
     brake: `[4]` N m s/rad, braking torque per wheel speed.
     """
 
     steering: jax.Array
+    speed: jax.Array | None
     angle: jax.Array
     gear: jax.Array
     torque: jax.Array
@@ -75,8 +78,53 @@ def actuate(
     brake = vehicle.brake_torque / (jnp.abs(wheel_speed) + SPIN_FLOOR)
     return Actuation(
         steering=steering,
+        speed=None,
         angle=jnp.concatenate([jnp.full(2, angle), jnp.zeros(2)]),
         gear=gear,
         torque=gear * jnp.maximum(pedal, 0.0) * torque,
         brake=jnp.maximum(-pedal, 0.0) * brake,
+    )
+
+
+def drive_sides(
+    vehicle: Vehicle,
+    skid: Skid,
+    command: Command,
+    steering: jax.Array,
+    speed: jax.Array,
+    wheel_speed: jax.Array,
+    seconds: float,
+) -> Actuation:
+    """The inputs of the wheels of a skid-steered vehicle, whose command is a speed and a yaw rate.
+
+    Each wheel is driven to the speed that it would roll at, by a pedal in proportion to what it
+    lacks. Beyond full pedal, torque and brakes are limited as those of other vehicles.
+
+    Args:
+        steering: `[]` rad/s of yaw, and speed: `[]` m/s, that sides were driven to before.
+        wheel_speed: `[4]` rad/s.
+    """
+    target = jnp.clip(command.steering, -vehicle.steering_limit, vehicle.steering_limit)
+    turn = vehicle.steering_rate * seconds
+    toward = (target - steering) * (1 - jnp.exp(-seconds / skid.turn_lag))
+    steering = steering + jnp.clip(toward, -turn, turn)
+    speed = speed + (command.speed - speed) * (1 - jnp.exp(-seconds / skid.speed_lag))
+    radius, left = vehicle.wheel_radius, vehicle.wheel_position[:, 1]
+    limit = vehicle.wheel_speed_limit
+    rolling = jnp.clip(skid.gain * (speed - steering * left) / radius, -limit, limit)
+    missing = rolling - wheel_speed
+    torque = jnp.minimum(
+        vehicle.wheel_torque, vehicle.wheel_power / jnp.maximum(jnp.abs(wheel_speed), 1.0)
+    )
+    torque = jnp.where(missing * wheel_speed < 0, vehicle.brake_torque, torque)
+    per_speed = vehicle.speed_gain * radius
+    # As a damper about the speed to be driven, which the integrator takes implicitly.
+    damper = torque * per_speed / jnp.maximum(per_speed * jnp.abs(missing), 1.0)
+    return Actuation(
+        steering=steering,
+        speed=speed,
+        angle=jnp.zeros(4),
+        gear=jnp.where(speed < 0, -1.0, 1.0),
+        torque=damper * rolling,
+        brake=damper,
     )

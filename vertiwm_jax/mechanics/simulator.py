@@ -16,7 +16,7 @@ from flax import struct
 
 from vertiwm_jax import geometry
 from vertiwm_jax.mechanics.contact import GroundContact, contacts, tangents
-from vertiwm_jax.mechanics.drivetrain import actuate
+from vertiwm_jax.mechanics.drivetrain import actuate, drive_sides
 from vertiwm_jax.mechanics.newton_euler import (
     ContactForce,
     DampedForce,
@@ -28,7 +28,7 @@ from vertiwm_jax.mechanics.newton_euler import (
     velocity_at,
 )
 from vertiwm_jax.mechanics.scm import ScmParams
-from vertiwm_jax.mechanics.suspension import ADHESION_SPEED, hull_contact, support, suspend
+from vertiwm_jax.mechanics.suspension import adhesion_speed, hull_contact, support, suspend
 from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle
 from vertiwm_jax.mechanics.wheel import SoilContact
 from vertiwm_jax.precision import float32
@@ -73,13 +73,15 @@ class SimulatorHistory:
 
     wheel_speed: `[4]` rad/s, positive forward.
     travel: `[4]` m, height of the wheel centers in the body.
-    steering: `[]` rad, angle of the front wheels.
+    steering: `[]` rad, angle of the front wheels; rad/s of yaw that the sides of a skid-steered
+        vehicle are driven to.
     gear: `[]` 1 forward, -1 reverse.
     sinkage: `[4]` m, of the wheels in soil; 0 on rigid ground.
     rut: `[2]` m, depth of the tracks that the rear wheels find, left and right.
     wheels: how each wheel met the ground in the last sub-step.
     force: `[4, 3]` N, of the ground on it: along the normal, along the rolling direction and to
         the left.
+    speed: `[]` m/s that the sides of a skid-steered vehicle are driven to, None of others.
     """
 
     wheel_speed: jax.Array
@@ -90,6 +92,7 @@ class SimulatorHistory:
     rut: jax.Array
     wheels: GroundContact
     force: jax.Array
+    speed: jax.Array | None = None
 
 
 class GroundForces(NamedTuple):
@@ -120,20 +123,25 @@ class Simulator:
         self, params: SimulatorParams, terrain: TerrainMap, state: VehicleState
     ) -> SimulatorHistory:
         """Wheels roll without slip, stand where the springs carry the weight, steer ahead; the gear
-        is forward."""
+        is forward. A skid-steered vehicle turns as its wheels roll."""
         vehicle, none = params.vehicle, jnp.zeros(4)
         load, travel = vehicle.mass * GRAVITY / 4, vehicle.travel_at_rest
         position = Vector.of(state.position)
         axes = Axes.from_quaternion(geometry.rotation_from_rpy(state.rpy).wxyz)
+        speed, steering, along = None, jnp.zeros(()), state.velocity[0]
+        if vehicle.skid is not None:
+            speed, steering = along / vehicle.skid.gain, state.angular_velocity[2]
+            along = along - steering * vehicle.wheel_position[:, 1]
         return SimulatorHistory(
-            wheel_speed=jnp.full(4, state.velocity[0] / vehicle.wheel_radius),
+            wheel_speed=jnp.full(4, along / vehicle.wheel_radius),
             travel=travel,
-            steering=jnp.zeros(()),
+            steering=steering,
             gear=jnp.ones(()),
             sinkage=none,
             rut=jnp.zeros(2),
             wheels=contacts(vehicle, terrain, position, axes, travel, none, none)[0],
             force=jnp.zeros((4, 3)).at[:, 0].set(load),
+            speed=speed,
         )
 
     @float32
@@ -196,7 +204,11 @@ def _substep(
     center = Vector.of(vehicle.centre_of_mass)
     forward = body.twist.linear.x
     spin, before = history.wheel_speed, history.sinkage
-    driven = actuate(vehicle, command, forward, history.steering, history.gear, spin, seconds)
+    if vehicle.skid is None or history.speed is None:
+        driven = actuate(vehicle, command, forward, history.steering, history.gear, spin, seconds)
+    else:
+        told = command, history.steering, history.speed
+        driven = drive_sides(vehicle, vehicle.skid, *told, spin, seconds)
     where = body.position, axes, history.travel, driven.angle
     wheels, hull = contacts(vehicle, terrain, *where, before)
     n, arm = wheels.normal, wheels.point.plus(center, -1.0)
@@ -214,7 +226,7 @@ def _substep(
     # What friction loses per slip: the secant to no friction at no slip.
     radius = vehicle.wheel_radius
     sliding = jnp.sqrt((ahead - radius * spin) ** 2 + drift**2 + CREEP_SPEED**2)
-    still = (CREEP_SPEED / ADHESION_SPEED * load) ** 2 + 1.0
+    still = (CREEP_SPEED / adhesion_speed(vehicle) * load) ** 2 + 1.0
     grip = jnp.sqrt((ground.torque / radius) ** 2 + ground.lateral**2 + still) / sliding
 
     # Wheel spin is eliminated: traction is what is left of it once the spin has answered.
@@ -269,6 +281,7 @@ def _substep(
         rut=history.rut + fresh * (sinkage[:2] - history.rut),
         wheels=wheels,
         force=jnp.stack([load, traction, ground.lateral], axis=-1),
+        speed=driven.speed,
     )
     of_wheels, of_hull = (axes.to_world(force).stacked() for force in (of_wheels, of_hull))
     on_ground = GroundForces(of_wheels, of_hull[0])

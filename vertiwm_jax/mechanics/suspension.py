@@ -28,7 +28,8 @@ HULL_DEPTH = 0.1
 CLIMB_SPEED = 2.0
 """Speed, m/s, at which a wheel that finds itself in the ground is lifted out of it."""
 ADHESION_SPEED = 0.1
-"""Slip speed, m/s, at which friction has reached 70 % of its limit."""
+"""Slip speed, m/s, at which friction has reached 70 % of its limit, where a vehicle does not say
+it."""
 
 
 class WheelSupport(NamedTuple):
@@ -103,11 +104,16 @@ def support(
     rate = press.stiffness * jnp.where(wheels.soft, yielding / together, 1.0)
 
     friction = jnp.minimum(wheels.friction, vehicle.tyre_friction)
-    on_rock = rigid_forces(wheel, friction, load, motion, ADHESION_SPEED)
+    on_rock = rigid_forces(wheel, friction, load, motion, adhesion_speed(vehicle))
     # Soil shears under the load that is really on it, whatever the sinkage says for now.
     loaded = jnp.minimum(load / jnp.maximum(in_soil.normal, 1.0), 1.0)
     ground = jax.tree.map(lambda a, b: jnp.where(wheels.soft, loaded * a, b), in_soil, on_rock)
     return ground, sinkage, load, rate
+
+
+def adhesion_speed(vehicle: Vehicle) -> jax.Array | float:
+    """Slip speed of a tire, m/s, at which friction has reached 70 % of its limit."""
+    return ADHESION_SPEED if vehicle.skid is None else vehicle.skid.slip_speed
 
 
 def hull_contact(

@@ -23,6 +23,21 @@ _AXLES = {"all": (1, 1, 1, 1), "rear": (0, 0, 1, 1), "front": (1, 1, 0, 0), "non
 
 
 @struct.dataclass
+class Skid:
+    """How a skid-steered vehicle, whose wheels do not turn, follows commands; each `[]`.
+
+    gain: speed that the wheels are driven to, as a share of the commanded one.
+    speed_lag, turn_lag: s, with which speed and yaw rate that wheels are driven to follow commands.
+    slip_speed: m/s at which friction of the tires reaches 71 % of its limit.
+    """
+
+    gain: jax.Array
+    speed_lag: jax.Array
+    turn_lag: jax.Array
+    slip_speed: jax.Array
+
+
+@struct.dataclass
 class Vehicle:
     """A vehicle with independent suspension; SI units, body axes.
 
@@ -49,6 +64,8 @@ class Vehicle:
     tyre_friction: `[]` the tire's own friction coefficient; contact takes the smaller one.
     hull: `[P, 3]` m, points of the chassis that touch the ground first, underside and roof.
     length, width: `[]` m, the rectangle that collides with obstacles, centered on the origin.
+    skid: of a skid-steered vehicle: `steering_limit` and `steering_rate` are then rad/s and rad/s2
+        of the yaw rate that it is told. None: the front wheels steer.
     driven: `[4]`, 1 of wheels that the engine drives, else 0; None: it drives all.
     locked: `[4]`, 1 of wheels that locked differentials bring to one speed, else 0; None: all
         differentials are open.
@@ -81,6 +98,7 @@ class Vehicle:
     driven: jax.Array | None = None
     locked: jax.Array | None = None
     wheel_angle: jax.Array | None = None
+    skid: Skid | None = None
 
     @property
     def wheelbase(self) -> jax.Array:
@@ -125,8 +143,29 @@ class Vehicle:
         return jax.tree.map(lambda leaf: leaf[which], self)
 
     def curvature(self, steering: jax.Array | np.ndarray) -> jax.Array:
-        """`[...]` 1/m of the arcs driven at a steering in [-1, 1], left positive."""
+        """`[...]` 1/m of the arcs driven at a steering in [-1, 1], left positive; those of a
+        skid-steered vehicle at the largest speed of its wheels."""
+        if self.skid is not None:
+            fastest = self.wheel_speed_limit * self.wheel_radius.mean()
+            return self.steering_limit * steering / fastest
         return jnp.tan(self.steering_limit * steering) / self.wheelbase
+
+
+@settings
+class SkidConfig:
+    """How a skid-steered vehicle follows commands; as in `Skid`."""
+
+    gain: Positive = 1.0
+    """Speed that the wheels are driven to, as a share of the commanded one."""
+    speed_lag: Positive = 0.1
+    """s, with which the speed that the wheels are driven to follows the commanded one."""
+    turn_lag: Positive = 0.1
+    """s, the same of the yaw rate."""
+    slip_speed: Positive = 0.1
+    """m/s of slip at which friction of the tires reaches 71 % of its limit."""
+
+    def check(self) -> None:
+        _expect_finite(self)
 
 
 @settings
@@ -162,9 +201,9 @@ class VehicleConfig:
     free_travel: tuple[float, float]
     """m, wheel height in the body at which the spring is relaxed."""
     steering_limit: Positive
-    """rad at the front wheels."""
+    """rad at the front wheels; rad/s of yaw of a skid-steered vehicle."""
     steering_rate: Positive
-    """rad/s at the front wheels."""
+    """rad/s at the front wheels; rad/s2 of yaw of a skid-steered vehicle."""
     speed_gain: Positive
     """s/m, pedal per speed error; full pedal is 1."""
     wheel_torque: Positive
@@ -189,13 +228,14 @@ class VehicleConfig:
     """The axles whose wheels locked differentials bring to one speed; others have open ones."""
     wheel_angle: tuple[Positive, Positive] = (1.0, 1.0)
     """Angle of the front wheels as a share of the commanded one, at half and at full lock."""
+    skid: SkidConfig | None = None
+    """Of a skid-steered vehicle: no wheel turns, and its sides are driven to the speeds of the
+    commanded speed and yaw rate. Without it, the front wheels steer."""
     scale: Positive = 1.0
     """The factor to HMMWV size: 10 for a 1/10-scale rover."""
 
     def check(self) -> None:
-        for name, value in vars(self).items():
-            if not isinstance(value, str) and not np.isfinite(value).all():
-                raise ValueError(f"{name}: expected finite numbers, found {value}")
+        _expect_finite(self)
         x, y, belly, roof = self.hull
         if not (x > 0 and y > 0 and belly < roof):
             expected = "half the length and half the width, > 0, and an underside below the roof"
@@ -207,6 +247,9 @@ class VehicleConfig:
         if self.drive != "all" and self.locked not in ("none", self.drive):
             expected = f"none or {self.drive}, as these wheels are driven"
             raise ValueError(f"locked: expected {expected}, found {self.locked!r}")
+        if self.skid and (self.drive, self.locked) != ("all", "none"):
+            expected = "drive: all and locked: none of a skid-steered vehicle"
+            raise ValueError(f"skid: expected {expected}, found {self.drive} and {self.locked}")
 
     @property
     def vehicle(self) -> Vehicle:
@@ -222,23 +265,34 @@ class VehicleConfig:
             "driven": None if self.drive == "all" else _AXLES[self.drive],
             "locked": None if self.locked == "none" else _AXLES[self.locked],
             "wheel_angle": None if self.wheel_angle == (1, 1) else self.wheel_angle,
+            "skid": self.skid and Skid(**vars(self.skid)),
         }
+        if self.skid:  # Rates of angles, which do not grow with size.
+            second = self.scale**0.5
+            values |= {name: values[name] / second for name in ("steering_limit", "steering_rate")}
+        given = {field.name: values[field.name] for field in fields(Vehicle)}
         arrays = {
-            field.name: None
-            if values[field.name] is None
-            else np.asarray(values[field.name], float)
-            for field in fields(Vehicle)
+            name: value if value is None or name == "skid" else np.asarray(value, float)
+            for name, value in given.items()
         }
         large = froude.scaled(Vehicle(**cast(dict[str, Any], arrays)), self.scale)
         return jax.tree.map(lambda x: np.asarray(x, np.float32), large)
 
 
 def stack(vehicles: Sequence[Vehicle]) -> Vehicle:
-    """Vehicles of any layouts as one with leaves `[N, ...]`, for `select`."""
+    """Vehicles of any layouts as one with leaves `[N, ...]`, for `select`.
+
+    Raises `ValueError` for skid-steered vehicles among others.
+    """
     every = [vars(vehicle) for vehicle in vehicles]
     plain = {"driven": _AXLES["all"], "locked": _AXLES["none"], "wheel_angle": (1, 1)}
     leaves: dict[str, Any] = {}
-    for name in every[0]:
+    skids = [vehicle.skid for vehicle in vehicles if vehicle.skid is not None]
+    if skids:
+        if len(skids) < len(vehicles):
+            raise ValueError("expected skid-steered vehicles alone, or none among others")
+        leaves["skid"] = jax.tree.map(lambda *leaf: np.stack(leaf), *skids)
+    for name in every[0].keys() - {"skid"}:
         given = [numbers[name] for numbers in every]
         if any(x is not None for x in given):
             filled = [np.array(plain[name], np.float32) if x is None else x for x in given]
@@ -271,6 +325,13 @@ def load_vehicle(name: str = HMMWV) -> Vehicle:
         ConfigError: there is no such vehicle, or its file is malformed.
     """
     return load(name).vehicle
+
+
+def _expect_finite(numbers: VehicleConfig | SkidConfig) -> None:
+    for name, value in vars(numbers).items():
+        told = value is None or isinstance(value, str | SkidConfig)
+        if not told and not np.isfinite(value).all():
+            raise ValueError(f"{name}: expected finite numbers, found {value}")
 
 
 def _box(x: float, y: float, belly: float, roof: float) -> list[tuple[float, float, float]]:

@@ -86,6 +86,8 @@ class Scene:
     @property
     def steering(self) -> np.ndarray:
         """`[T + 1, 4]` angle of each wheel, rad, left positive; as commanded where unknown."""
+        if self.vehicle.skid is not None:
+            return np.zeros((self.steps + 1, 4))
         front = self.wheels and self.wheels.steer_angle
         if front is None:
             front = np.repeat(self.commanded[:, 1:], 2, axis=1)
