@@ -79,7 +79,7 @@ def make_logs(
         for source in sources:
             arrays, meta = schema.read(source)
             terrain = files.load_map(schema.find_map(source, meta["map"]))
-            arrays = schema.check(source, arrays, terrain.offset())
+            arrays = schema.check(source, arrays, terrain.offset(), driven.turn)
             rows = []
             for number, length in enumerate(arrays["length"]):
                 state = arrays["state"][number, : length + 1]

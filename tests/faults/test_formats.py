@@ -67,7 +67,7 @@ planar without a map      lifted   lifted   lifted   lifted   lifted   lifted   
 commands act late         told     told     told     told     told     told     told     told
 yaw rates                 read     read     read     read     read     read     read     read
 wheel speeds              read     read     -        -        -        -        -        -
-turns on the spot         cut      cut      cut      cut      cut      cut      cut      cut
+turns on the spot         read     read     read     read     read     read     read     read
 one bad log of four       told     told     told     told     told     told     told     told
 three bad logs of four    refused  refused  refused  refused  refused  refused  refused  refused
 one bad drive of four     told     told     -        -        -        -        -        -
@@ -279,9 +279,8 @@ DEFECTS = {
             of_vehicle(steered="skid"),
             of_tables(speed=None, steering=None, left="left", right="right"),
         ),
-        yaw_rates=True,
     ),
-    "turns on the spot": Defect(turning, settings=SKID, words="on the spot", drives=2),
+    "turns on the spot": Defect(turning, settings=SKID, error=np.inf),
     "one bad log of four": Defect(
         damage=lambda whole: b"?" * 99, bad=(False, True, False, False), drives=3, words="1.log"
     ),

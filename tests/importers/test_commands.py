@@ -20,26 +20,16 @@ def test_wheel_speeds_are_speed_and_yaw_rate():
     np.testing.assert_allclose(yaw_rate, [0.0, 1.0, -0.5, 2.0 / 1.2])
 
 
-@pytest.mark.parametrize("scale", [1.0, 9.0])
-def test_a_bicycle_turns_as_the_wheels_of_both_sides_do(scale):
+def test_a_skid_steered_vehicle_is_told_speed_and_yaw_rate_however_they_were_logged():
     wheels = np.random.default_rng(0).uniform(-2, 2, (200, 2))
-    vehicle = replace(SKID, scale=scale)
-    speed, angle = commands.of_bicycle(wheels, "wheels", vehicle).T
-    _, yaw_rate = commands.differential(*wheels.T, vehicle.track)
-    said = np.isfinite(angle)
-    turned = speed[said] * np.tan(angle[said]) / vehicle.wheelbase
-    np.testing.assert_allclose(turned, yaw_rate[said], atol=1e-9)
-    # Only turns about a point within a fifth of the wheelbase are not said.
-    assert 0 < (~said).sum() < 100
-    np.testing.assert_array_less(np.abs(speed[~said] / yaw_rate[~said]), vehicle.wheelbase / 5)
-
-
-def test_standing_is_said():
-    standing = np.array([[0.0, 0.0], [0.0, 0.001], [-0.001, 0.0]])
-    found = commands.of_bicycle(standing, "yaw_rate", SKID)
-    np.testing.assert_allclose(found[:, 1], 0.0)
-    around = commands.of_bicycle(np.array([[0.0, 0.5]]), "yaw_rate", SKID)
-    assert np.isnan(around[0, 1])
+    speed, yaw_rate = commands.of_vehicle(wheels, "wheels", SKID).T
+    np.testing.assert_allclose([speed, yaw_rate], commands.differential(*wheels.T, SKID.track))
+    around = np.array([[0.0, 0.5], [0.0, -3.0]])
+    np.testing.assert_array_equal(commands.of_vehicle(around, "yaw_rate", SKID), around)
+    bicycle = np.array([[2.0, 0.3], [-1.0, 0.3], [0.0, 0.3]])
+    turned = commands.of_vehicle(bicycle, "steering", SKID)[:, 1]
+    np.testing.assert_allclose(turned, bicycle[:, 0] * np.tan(0.3) / SKID.wheelbase)
+    np.testing.assert_array_equal(commands.of_vehicle(bicycle, "steering", VEHICLE), bicycle)
 
 
 def test_wheel_speeds_are_those_of_a_skid_steered_vehicle():

@@ -1,9 +1,12 @@
+import json
+
 import numpy as np
 import pytest
 from learning.recordings import STEPS, drives, wheel_signals, write
 
 from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.mechanics import vehicle
 
 
 def broken(name: str, place: tuple, value: float) -> np.ndarray:
@@ -143,3 +146,34 @@ def test_damage_anywhere_in_an_archive_is_one_error_or_none(tmp_path, write_arch
         except DataError as error:
             named += str(error).startswith(f"{path}: ")
     assert named > 200
+
+
+def skid(turn: str = "yaw_rate") -> np.ndarray:
+    return np.array(json.dumps({"map": "hill.npz", "vehicle": {"turn": turn}}))
+
+
+def test_files_of_skid_steered_vehicles_tell_yaw_rates(tmp_path):
+    turning = broken("control", (0, slice(None), 1), 5.0)
+    write(tmp_path, control=turning, meta=skid())
+    found, _ = dataset.load_drives(tmp_path, "all")
+    assert found.turn == "yaw_rate" and np.asarray(found.control)[0, 0, 1] == 5.0
+    found.expect_steered_by(vehicle.load("husky"))
+    with pytest.raises(DataError, match=r"vehicle: expected one skid-steered, .* yaw rate, found"):
+        found.driven(vehicle.load("hmmwv"))
+    write(tmp_path, control=broken("control", (0, 3, 1), 40.0), meta=skid())
+    with pytest.raises(DataError, match="control: expected finite commanded yaw rate in rad/s"):
+        dataset.load_drives(tmp_path, "all")
+
+
+def test_commands_of_two_kinds_are_not_mixed(tmp_path):
+    write(tmp_path)
+    front, _ = dataset.load_drives(tmp_path, "all")
+    assert front.turn == "steering"
+    with pytest.raises(DataError, match="expected one with front wheels that steer"):
+        front.expect_steered_by(vehicle.load("husky"))
+    write(tmp_path, "b.npz", meta=skid())
+    with pytest.raises(DataError, match=r"b\.npz: meta: expected vehicle\.turn steering"):
+        dataset.load_drives(tmp_path, "all")
+    write(tmp_path, "b.npz", meta=skid("wheel speeds"))
+    with pytest.raises(DataError, match=r"expected vehicle\.turn steering or yaw_rate, found 'wh"):
+        dataset.load_drives(tmp_path, "all")

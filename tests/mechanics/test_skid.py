@@ -9,6 +9,7 @@ import pytest
 
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.dynamics import rollout
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.mechanics import vehicle as vehicles
 from vertiwm_jax.mechanics.drivetrain import drive_sides
 from vertiwm_jax.mechanics.kinematic import DifferentialDrive, differential_of, place
@@ -164,7 +165,7 @@ def test_skid_steered_vehicles_are_stacked_alone():
     second = both.select(jnp.int32(1))
     assert float(second.mass) == 80.0 and second.skid is not None and ROBOT.skid is not None
     assert float(second.skid.gain) == pytest.approx(ROBOT.skid.gain)
-    with pytest.raises(ValueError, match="skid-steered"):
+    with pytest.raises(UserError, match="skid-steered"):
         vehicles.stack([ROBOT.vehicle, vehicles.load_vehicle()])
 
 

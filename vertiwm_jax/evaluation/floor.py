@@ -72,11 +72,13 @@ class FloorTest:
         """Drives, and writes what is asked for; returns the tables as Markdown."""
         if self.simulator == "chrono":
             chrono.modules()
-        driven = vehicle.load(self.vehicle).vehicle
+        numbers = vehicle.load(self.vehicle)
         recorded, terrain = dataset.load_drives(self.data, self.split, self.splits)
+        recorded.expect_steered_by(numbers)
+        driven = numbers.vehicle
         steps, rng = self.context + max(self.horizons), np.random.default_rng(self.seed)
-        numbers = list(range(0, len(recorded.length), self.every))
-        tasks = [_task(recorded, terrain, number, steps, rng) for number in numbers]
+        chosen = range(0, len(recorded.length), self.every)
+        tasks = [_task(recorded, terrain, number, steps, rng) for number in chosen]
         pairs = []
         with processes.simulating(self.jobs) as mapped, Progress(len(tasks), "drives") as progress:
             for pair in mapped(partial(twice, self.simulator, driven, self.context), tasks):
@@ -93,7 +95,7 @@ class FloorTest:
             control=first["control"],
             length=np.minimum(first["length"], second["length"]),
             wheel_class=first["wheel_class"],
-            world=np.asarray(recorded.world)[[numbers[i] for i in lasting]],
+            world=np.asarray(recorded.world)[[chosen[i] for i in lasting]],
             wheels=WheelSignals(),
             vehicles=(self.vehicle,) * terrain.worlds,
         )

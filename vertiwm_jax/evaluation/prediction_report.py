@@ -20,7 +20,13 @@ from vertiwm_jax.evaluation.tables import csv_text, markdown, write
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.dataset import Collection, SplitConfig
 from vertiwm_jax.mechanics import vehicle
-from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
+from vertiwm_jax.mechanics.kinematic import (
+    ConstantVelocity,
+    DifferentialDrive,
+    KinematicBicycle,
+    bicycle_of,
+    differential_of,
+)
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.models.config import SoilSource
 from vertiwm_jax.models.registry import ModelName, load_fitted, load_model
@@ -96,10 +102,17 @@ class PredictionTest:
         if self.vehicle:
             drives = replace(drives, described=(None,) * terrain.worlds)
         driven = drives.driven(given)
-        own = {
+        own: dict[str, tuple[Dynamics, Params]] = {
             "builtin": (Simulator(), jax.vmap(chrono_like)(driven)),
-            "kinematic bicycle": (KinematicBicycle(), jax.vmap(bicycle_of)(driven)),
         }
+        if driven.skid is None:
+            own["kinematic bicycle"] = KinematicBicycle(), jax.vmap(bicycle_of)(driven)
+        else:
+            kinematic = jax.vmap(differential_of)(driven, driven.skid)
+            own["differential drive"] = DifferentialDrive(), kinematic
+            for name in [name for name in models if not _is_skid_steered(models[name][1])]:
+                _log.info("%s is left out: front wheels steer what it drives", name)
+                del models[name]
         models |= own
         models["constant velocity"] = ConstantVelocity(), None
         every, tests = TestWindows.nested(drives, terrain, self.context, self.horizons, self.stride)
@@ -119,7 +132,8 @@ class PredictionTest:
             found += made
             tables.append(yardsticks.table(made))
             if self.output and steps == max(tests):
-                drawn = {name: cut[name] for name in self.models}
+                drawn = {name: cut[name] for name in self.models if name in cut}
+                drawn = drawn or {"builtin": cut["builtin"]}
                 growth = {
                     name: prediction.summary(name, each.states, test).growth
                     for name, each in cut.items()
@@ -130,6 +144,10 @@ class PredictionTest:
         if self.json:
             atomic.write(self.json, yardsticks.json_text(found))
         return "\n\n".join(tables)
+
+
+def _is_skid_steered(params: Params) -> bool:
+    return getattr(getattr(params, "vehicle", None), "skid", None) is not None
 
 
 def _files(

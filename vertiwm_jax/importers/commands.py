@@ -1,4 +1,4 @@
-"""Commands of logs, however they were given, as a speed and a front-wheel angle."""
+"""Commands of logs, however they were given, as a speed and a front-wheel angle or a yaw rate."""
 
 from typing import Literal
 
@@ -10,19 +10,21 @@ Kind = Literal["steering", "yaw_rate", "wheels"]
 """Speed and front-wheel angle, speed and yaw rate, or speeds of the left and the right wheels."""
 _SLOWEST = 0.05  # m/s at full size
 _FARTHEST = np.radians(45)
-_TIGHTEST = np.tan(np.radians(80))
 
 
-def of_bicycle(command: np.ndarray, kind: Kind, vehicle: VehicleSettings) -> np.ndarray:
-    """`[M, 2]` commands in SI units to `[M, 2]` m/s and rad, NaN where no angle turns like that."""
+def of_vehicle(command: np.ndarray, kind: Kind, vehicle: VehicleSettings) -> np.ndarray:
+    """`[M, 2]` commands in SI units to those of drives: m/s, and the angle of front wheels, rad, or
+    the yaw rate of a skid-steered vehicle, rad/s."""
+    speed, turn = command[:, 0], command[:, 1]
+    if kind == "wheels":
+        speed, turn = differential(speed, turn, vehicle.track)
+    if vehicle.steered == "skid":
+        yaw_rate = speed * np.tan(turn) / vehicle.wheelbase if kind == "steering" else turn
+        return np.stack([speed, yaw_rate], axis=1)
     if kind == "steering":
         return command
-    speed, yaw_rate = command[:, 0], command[:, 1]
-    if kind == "wheels":
-        speed, yaw_rate = differential(speed, yaw_rate, vehicle.track)
-    angle_of = skidding if vehicle.steered == "skid" else steering
     slowest = _SLOWEST / vehicle.scale**0.5
-    return np.stack([speed, angle_of(speed, yaw_rate, vehicle.wheelbase, slowest)], axis=1)
+    return np.stack([speed, steering(speed, turn, vehicle.wheelbase, slowest)], axis=1)
 
 
 def differential(
@@ -45,16 +47,3 @@ def steering(
     angle = np.clip(angle, -_FARTHEST, _FARTHEST)
     latest = np.maximum.accumulate(np.where(moving, np.arange(len(speed)), -1))
     return np.where(latest >= 0, angle[latest], 0)
-
-
-def skidding(
-    speed: np.ndarray, yaw_rate: np.ndarray, wheelbase: float, slowest: float = _SLOWEST
-) -> np.ndarray:
-    """`[M]` m/s and rad/s to the `[M]` angles, rad, of a bicycle that turns as a skid-steered
-    vehicle does; NaN where that turns on the spot, or nearly so."""
-    around = wheelbase * yaw_rate
-    standing = (np.abs(speed) < slowest) & (np.abs(around) < slowest)
-    held = standing | (np.abs(around) <= _TIGHTEST * np.abs(speed))
-    return np.where(
-        held, np.arctan(np.where(standing, 0, around) / np.where(speed, speed, 1)), np.nan
-    )

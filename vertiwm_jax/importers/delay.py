@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
+from vertiwm_jax.learning.schema import Turn
+
 _GRID = 0.01
 _DELAYS = np.arange(0, 0.805, _GRID)
 _LAGS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.2)
@@ -23,7 +25,8 @@ class Response:
     """A drive without gaps, and all commands of its log.
 
     time: `[T]` s; speed, yaw_rate: `[T]` m/s and rad/s; command_time: `[M]` s; command: `[M, 2]`
-    speed and front-wheel angle, m/s and rad, each held until the next.
+    speed and turn, m/s and rad or rad/s, each held until the next; turn: what turns, a front-wheel
+    angle or the yaw rate of a skid-steered vehicle.
     """
 
     time: np.ndarray
@@ -31,6 +34,7 @@ class Response:
     yaw_rate: np.ndarray
     command_time: np.ndarray
     command: np.ndarray
+    turn: Turn = "steering"
 
 
 @dataclass(frozen=True)
@@ -47,9 +51,9 @@ class Delay:
 def estimate(responses: Sequence[Response], window: float = 0.0) -> Delay | None:
     """The delay with which first-order lags explain speeds and yaw rates best.
 
-    The speed follows the commanded one, the yaw rate the speed times the tangent of the angle, each
-    with a gain, an offset and a lag of its own; the delay is of both. What neither explains, or
-    would at most delays, has none: None.
+    The speed follows the commanded one, the yaw rate the speed times the tangent of the angle, or
+    the commanded yaw rate, each with a gain, an offset and a lag of its own; the delay is of both.
+    What neither explains, or would at most delays, has none: None.
 
     responses: of one vehicle; window: s over which parabolas were fitted to positions, where speeds
     and yaw rates are their slopes.
@@ -63,7 +67,8 @@ def estimate(responses: Sequence[Response], window: float = 0.0) -> Delay | None
     samples = len(along) / _APART
     loss, lags = np.zeros(len(_DELAYS)), list[np.ndarray | None]()
     for column, motion in enumerate(motions.values()):
-        weight = along if column else np.ones(len(along))
+        angle = column and responses[0].turn == "steering"
+        weight = along if angle else np.ones(len(along))
         unexplained = np.array(
             [
                 _unexplained(responses, column, lag, window, motion[every], weight, every)
@@ -107,7 +112,7 @@ def _unexplained(
 def _followed(response: Response, column: int, lag: float, window: float) -> np.ndarray:
     """`[D, T]` the command as a first-order lag follows it, at each delay."""
     held, command = response.command_time, response.command[:, column]
-    command = np.nan_to_num(np.tan(command) if column else command)
+    command = np.tan(command) if column and response.turn == "steering" else command
     grid = np.arange(response.time[0] - _BEFORE, response.time[-1] + _GRID, _GRID)
     told = command[np.maximum(np.searchsorted(held, grid + 1e-9, side="right") - 1, 0)]
     decay = np.exp(-_GRID / lag) if lag else 0.0

@@ -21,7 +21,7 @@ from vertiwm_jax.importers.resampling import Drive
 from vertiwm_jax.importers.settings import GridMapSettings, ImportSettings
 from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.dataset import SplitConfig
-from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.learning.schema import DataError, Turn
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain import files, query
@@ -114,7 +114,7 @@ def import_drives(
         meta = {"sources": [str(path) for path in logs], "map": "map.npz"}
         wheels = settings.vehicle.wheels_in_body_xy
         placed = schema.in_file(_arrays(drives), ground.offset())
-        schema.write(unfinished / "drives.npz", placed, meta, wheels)
+        schema.write(unfinished / "drives.npz", placed, meta, wheels, settings.vehicle.turn)
     remarks += [*refused.values(), *_remarks(drives, ground, settings.vehicle.scale)]
     if delays:
         remarks.append(_lateness(delays, settings.vehicle.scale**0.5))
@@ -205,14 +205,14 @@ def _import(
         found, others = resampling.resample(log, settings.resampling, point)
         try:
             if found:
-                schema.check_values(log.name, _arrays(found))
+                schema.check_values(log.name, _arrays(found), turn=vehicle.turn)
         except DataError as error:
             refused.append(str(error))
             continue
         inside = [((xy.state[:, :2] >= low) & (xy.state[:, :2] <= high)).all() for xy in found]
         kept = [drive for drive, stays in zip(found, inside, strict=True) if stays]
         drives += kept
-        responses += [_response(log, drive) for drive in kept]
+        responses += [_response(log, drive, vehicle.turn) for drive in kept]
         gone = [drive.start for drive, stays in zip(found, inside, strict=True) if not stays]
         if gone:
             others["off the map"] += gone
@@ -259,10 +259,10 @@ def _import(
     return drives, row, late
 
 
-def _response(log: Log, drive: Drive) -> Response:
+def _response(log: Log, drive: Drive, turn: Turn) -> Response:
     time = drive.start + STEP_SECONDS * np.arange(len(drive.state))
     speed, yaw_rate = drive.state[:, 6], drive.state[:, 11]
-    return Response(time, speed, yaw_rate, log.command_time, log.command)
+    return Response(time, speed, yaw_rate, log.command_time, log.command, turn)
 
 
 def _arrays(drives: Sequence[Drive]) -> dict[str, np.ndarray]:

@@ -24,8 +24,8 @@ class Log:
 
     time: `[N]` s, increasing; position: `[N, 3]` p_world, m; attitude: of body to world, `[N, 3]`
     roll, pitch, yaw, rad, or `[N, 4]` quaternions x, y, z, w; command_time: `[M]` s, increasing;
-    command: `[M, 2]` speed and front-wheel angle, m/s and rad, NaN where a vehicle was told to turn
-    on the spot; kind: what a reader gives instead; velocity: `[N, 3]` v_body, m/s, and
+    command: `[M, 2]` speed and front-wheel angle, m/s and rad, or of a skid-steered vehicle the yaw
+    rate, rad/s; kind: what a reader gives instead; velocity: `[N, 3]` v_body, m/s, and
     angular_velocity: `[N, 3]` omega_body, rad/s, None where they were not logged; name: of the
     file, and of the drive in it; remarks: what was found and left out of the file, and how many
     samples.
@@ -110,13 +110,14 @@ def _in_si(log: Log, settings: ImportSettings) -> Log:
         return turned if frame == "body" else rotation.inv().apply(turned)
 
     turn = units.speed if log.kind == "wheels" else units.steering
-    commanded = commands.of_bicycle(log.command * [units.speed, turn], log.kind, settings.vehicle)
+    commanded = commands.of_vehicle(log.command * [units.speed, turn], log.kind, settings.vehicle)
     return Log(
         time=second * units.time * log.time,
         position=meter * (axes * units.position * log.position - np.asarray(frames.origin)),
         attitude=attitude,
         command_time=second * (units.time * log.command_time + settings.resampling.delay),
-        command=commanded * [meter / second, 1],
+        command=commanded
+        * [meter / second, 1 if settings.vehicle.turn == "steering" else 1 / second],
         velocity=in_body(log.velocity, units.velocity * meter / second, frames.velocity),
         angular_velocity=in_body(
             log.angular_velocity, units.angle / second, frames.angular_velocity

@@ -55,7 +55,10 @@ def resample(
     leaps = moved > _NEAR + _FASTEST * np.diff(log.time)
     if leaps.any():
         left_out["cut at a leap of the position"] += log.time[1:][leaps].tolist()
-    commanded = list(_commanded(log, settings.command_gap, left_out))
+    commanded = [
+        (log.command_time[run][0], log.command_time[run][-1] + settings.command_gap)
+        for run in _runs(log.command_time, settings.command_gap)
+    ]
     for poses in _runs(log.time, settings.gap, leaps):
         part = log.part(poses)
         last = part.time[-1]
@@ -99,17 +102,6 @@ def _runs(stamps: np.ndarray, gap: float, cut: np.ndarray | bool = False) -> Ite
     cuts = np.flatnonzero((np.diff(stamps) > gap) | cut) + 1
     for first, end in pairwise([0, *cuts, len(stamps)]):
         yield slice(first, end)
-
-
-def _commanded(log: Log, gap: float, left_out: LeftOut) -> Iterator[tuple[float, float]]:
-    """When commands that can be held begin, and until when they hold."""
-    time, held = log.command_time, np.isfinite(log.command[:, 1])
-    for run in _runs(time, gap, held[1:] != held[:-1]):
-        first, until = time[run][0], time[run][-1] + gap
-        if held[run.start]:
-            yield first, min(until, time[run.stop]) if run.stop < len(time) else until
-        else:
-            left_out["turns on the spot"].append(first)
 
 
 def _state(log: Log, at: np.ndarray, window: float, logged_point: np.ndarray) -> np.ndarray:

@@ -28,11 +28,15 @@ class VehicleSettings:
     """m; needed to set logs of x, y and yaw alone on the ground."""
     steered: Literal["front", "skid"] = "front"
     """By wheels that turn, or by different speeds of the wheels of both sides. Yaw rates that no
-    front wheel can follow are followed as far as it turns; those of a skid-steered vehicle that
-    turns on the spot end a drive."""
+    front wheel can follow are followed as far as it turns."""
     scale: Positive = 1.0
     """The factor from the vehicle to full size, as in its file: 10 for a 1/10-scale rover. Drives
     and map are enlarged by it, times and speeds by its square root, before `resampling`."""
+
+    @property
+    def turn(self) -> Literal["steering", "yaw_rate"]:
+        """What the second of the commands of its drives is."""
+        return "yaw_rate" if self.steered == "skid" else "steering"
 
     @property
     def wheels_in_body_xy(self) -> list[list[float]]:

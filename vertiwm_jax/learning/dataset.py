@@ -16,7 +16,7 @@ from flax import struct
 from vertiwm_jax import geometry
 from vertiwm_jax.config import Share, settings
 from vertiwm_jax.learning import schema
-from vertiwm_jax.learning.schema import SPLITS, DataError
+from vertiwm_jax.learning.schema import SPLITS, DataError, Turn
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.measured import is_described, measured
 from vertiwm_jax.mechanics.vehicle import Vehicle, VehicleConfig
@@ -74,7 +74,7 @@ class Drives:
     values have no meaning; wheel_class: `[D, T + 1, 4]` uint8; world: `[D]` index into
     the terrain map; wheels: leaves `[D, T + 1, ...]` float32; vehicles: by world, the name of the
     vehicle that drove there, static; described: by world, that vehicle where its file describes it,
-    static.
+    static; turn: what the second of the commands is, static.
     """
 
     state: Array
@@ -85,13 +85,29 @@ class Drives:
     wheels: WheelSignals
     vehicles: tuple[str, ...] = struct.field(default=(), pytree_node=False)
     described: tuple[VehicleConfig | None, ...] = struct.field(default=(), pytree_node=False)
+    turn: Turn = struct.field(default="steering", pytree_node=False)
 
     def driven(self, otherwise: VehicleConfig) -> Vehicle:
         """The vehicles that drove, leaves `[W, ...]`, to `select` by world.
 
         otherwise: where a file describes none.
+
+        Raises `DataError` unless they are steered as the drives were.
         """
-        return vehicle.stack([(own or otherwise).vehicle for own in self.described])
+        every = [own or otherwise for own in self.described]
+        for each in every:
+            self.expect_steered_by(each)
+        return vehicle.stack([each.vehicle for each in every])
+
+    def expect_steered_by(self, driven: VehicleConfig) -> None:
+        """Raises `DataError` unless a vehicle takes such commands as the drives have."""
+        if driven.turn != self.turn:
+            kinds = {"steering": "with front wheels that steer", "yaw_rate": "skid-steered"}
+            raise DataError(
+                f"vehicle: expected one {kinds[self.turn]}, as commands of the drives have a "
+                f"{self.turn.replace('_', ' ')}, found one {kinds[driven.turn]}; `--vehicle` names "
+                "another"
+            )
 
 
 @settings
@@ -277,7 +293,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], TerrainMap]:
     arrays, meta = schema.read(path)
     arrays.pop("split", None)
     terrain = files.load_map(schema.find_map(path, meta["map"]))
-    arrays = schema.check(path, arrays, terrain.offset())
+    turn = schema.turn_of(path, schema.vehicle_facts(path))
+    arrays = schema.check(path, arrays, terrain.offset(), turn)
     _check_place(path, arrays, terrain)
     if "wheel_class" not in arrays:
         wheels = np.asarray(meta["vehicle"]["wheels_in_body_xy"], np.float32)
@@ -329,8 +346,15 @@ def _join(paths: list[Path], parts: list[dict[str, np.ndarray]]) -> Drives:
         measured(own, f"{path}: meta.vehicle") if is_described(own) else None
         for path, own in zip(paths, facts, strict=True)
     )
+    turns: list[Turn] = [schema.turn_of(path, own) for path, own in zip(paths, facts, strict=True)]
+    for path, turn in zip(paths, turns, strict=True):
+        if turn != turns[0]:
+            raise DataError(
+                f"{path}: meta: expected vehicle.turn {turns[0]}, as in {paths[0]}, found {turn}"
+            )
     return Drives(
         **joined,
+        turn=turns[0],
         wheels=signals,
         vehicles=tuple(map(schema.vehicle_name, facts)),
         described=tuple(described),

@@ -62,6 +62,7 @@ def identify(
     begin = vehicles.load(vehicle) if isinstance(vehicle, str) else vehicle
     configuration.expect_fields(free, VehicleConfig, where="free: ")
     recorded, terrain = load_drives(drives, "train", FITTED)
+    recorded.expect_steered_by(begin)
     index = windows.index(recorded, terrain, _CONTEXT, horizon, horizon)
     every = -(-len(index.start) // _MOST_WINDOWS)
     chosen = windows.gather(recorded, index, np.arange(0, len(index.start), every))

@@ -336,6 +336,7 @@ class _Pipeline:
             drives, terrain = dataset.load_drives(
                 folders(self.config, kinds), split, self.config.splits
             )
+            drives.expect_steered_by(vehicle.load(self.config.vehicle or vehicle.HMMWV))
             self.loaded[key] = replace(drives, wheels=WheelSignals()), terrain
         return self.loaded[key]
 

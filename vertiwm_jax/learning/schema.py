@@ -3,7 +3,9 @@
 A collection is a folder of `.npz` files, one a world, each with K drives of T steps at 10 Hz:
 
     state          [K, T + 1, 12]    p_world m, roll pitch yaw rad, v_body m/s, omega_body rad/s
-    control        [K, T, 2]         commanded speed m/s, front-wheel angle rad, from t to t + 1
+    control        [K, T, 2]         commanded speed m/s and turn, from t to t + 1: a front-wheel
+                                     angle rad, or the yaw rate rad/s where meta has
+                                     "vehicle": {"turn": "yaw_rate"}, of a skid-steered vehicle
     length         [K]               valid steps of each drive
     meta           text              JSON with "map", the file name of the terrain map; may have
                                      "vehicle": {"name": ...}, and describe the vehicle there
@@ -34,7 +36,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,6 +56,8 @@ WHEEL_SIGNALS = {
     "steer_angle": (2,),
 }
 """What may be recorded beside the states, and its shape at one moment."""
+Turn = Literal["steering", "yaw_rate"]
+"""What the second of two commands is: a front-wheel angle, rad, or a yaw rate, rad/s."""
 UNNAMED = "unnamed"
 """A vehicle whose name no file says."""
 _REQUIRED = {"state": (12,), "control": (2,), "length": ()}
@@ -67,13 +71,16 @@ _LIMITS = (
     ("state", slice(6, 9), 50.0, "velocity in m/s"),
     ("state", slice(9, 12), 10 * np.pi, "angular velocity in rad/s"),
     ("control", 0, 50.0, "commanded speed in m/s"),
-    ("control", 1, np.pi / 2, "front-wheel angle in rad"),
     ("wheel_omega", _ALL, 3e3, "wheel speed in rad/s"),
     ("wheel_sinkage", _ALL, 10.0, "depth in m"),
     ("wheel_force", _ALL, 1e6, "force in N"),
     ("chassis_force", _ALL, 1e6, "force in N"),
     ("steer_angle", _ALL, np.pi / 2, "wheel angle in rad"),
 )
+_TURN_LIMITS: dict[Turn, tuple[str, int, float, str]] = {
+    "steering": ("control", 1, np.pi / 2, "front-wheel angle in rad"),
+    "yaw_rate": ("control", 1, 10 * np.pi, "commanded yaw rate in rad/s"),
+}
 """Array, columns, largest absolute value and meaning: degrees, millimeters and km/h lie beyond."""
 _FLOATS = tuple(dict.fromkeys(name for name, *_ in _LIMITS))
 _MOVING = 1.0
@@ -140,6 +147,16 @@ def vehicle_facts(path: Path) -> dict[str, Any]:
     return vehicle if isinstance(vehicle, dict) else {}
 
 
+def turn_of(path: Path, facts: Mapping[str, Any]) -> Turn:
+    """What the second of the commands of a file is, by what it says of its vehicle."""
+    turn = facts.get("turn", "steering")
+    for known in get_args(Turn):
+        if turn == known:
+            return known
+    known = " or ".join(get_args(Turn))
+    raise DataError(f"{path}: meta: expected vehicle.turn {known}, found {turn!r}")
+
+
 def vehicle_name(facts: Mapping[str, Any]) -> str:
     """What a file calls its vehicle by name or model; or else `UNNAMED`."""
     return str(facts.get("name") or facts.get("model") or UNNAMED)
@@ -181,14 +198,18 @@ def in_file(arrays: Mapping[str, np.ndarray], offset: np.ndarray) -> Mapping[str
 
 
 def write(
-    path: Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], wheels: ArrayLike
+    path: Path,
+    arrays: Mapping[str, np.ndarray],
+    meta: Mapping[str, Any],
+    wheels: ArrayLike,
+    turn: Turn = "steering",
 ) -> None:
     """Writes a file, whole or not at all.
 
     arrays: with positions as in the file of the map, see `in_file`. meta: holds "map", the name of
-    that file. wheels: `[4, 2]` x, y in the body, m.
+    that file. wheels: `[4, 2]` x, y in the body, m. turn: what the second of the commands is.
     """
-    vehicle = {"wheels_in_body_xy": np.asarray(wheels).tolist()}
+    vehicle = {"wheels_in_body_xy": np.asarray(wheels).tolist(), "turn": turn}
     text = json.dumps({**meta, "dt": STEP_SECONDS, "vehicle": vehicle})
     stream = io.BytesIO()
     stored: dict[str, Any] = {**arrays, "meta": np.array(text)}
@@ -216,20 +237,26 @@ def find_map(path: Path, name: str) -> Path:
 
 
 def check(
-    path: Path, arrays: dict[str, np.ndarray], offset: np.ndarray = np.zeros(2)
+    path: Path,
+    arrays: dict[str, np.ndarray],
+    offset: np.ndarray = np.zeros(2),
+    turn: Turn = "steering",
 ) -> dict[str, np.ndarray]:
     """Arrays of the schema, numbers in float32; raises `DataError`, which names `path`.
 
     They have to be of the right shape, finite where they are valid, and in SI units. offset:
-    `TerrainMap.offset` of their map, which is taken off the positions.
+    `TerrainMap.offset` of their map, which is taken off the positions. turn: see `turn_of`.
     """
-    arrays = check_values(path, arrays, offset)
+    arrays = check_values(path, arrays, offset, turn)
     check_travel(path, arrays)
     return arrays
 
 
 def check_values(
-    path: str | Path, arrays: dict[str, np.ndarray], offset: np.ndarray = np.zeros(2)
+    path: str | Path,
+    arrays: dict[str, np.ndarray],
+    offset: np.ndarray = np.zeros(2),
+    turn: Turn = "steering",
 ) -> dict[str, np.ndarray]:
     """As `check`, but whether positions move with the velocities is left aside."""
     if arrays["control"].ndim != 3:
@@ -264,7 +291,7 @@ def check_values(
         arrays = arrays | {"state": arrays["state"] - np.pad(offset, (0, 10))}
     arrays = arrays | {name: arrays[name].astype(np.float32) for name in _FLOATS if name in arrays}
     valid = np.arange(steps + 1) <= length[:, None]
-    for name, columns, limit, meaning in _LIMITS:
+    for name, columns, limit, meaning in (*_LIMITS, _TURN_LIMITS[turn]):
         if name in arrays:
             values = arrays[name][valid[:, 1:] if name == "control" else valid][..., columns]
             bad = ~(np.abs(values) <= limit)

@@ -13,6 +13,7 @@ from flax import struct
 from vertiwm_jax import config as configuration
 from vertiwm_jax import froude
 from vertiwm_jax.config import Positive, settings
+from vertiwm_jax.errors import UserError
 from vertiwm_jax.precision import float32
 from vertiwm_jax.state import Command
 
@@ -252,6 +253,11 @@ class VehicleConfig:
             raise ValueError(f"skid: expected {expected}, found {self.drive} and {self.locked}")
 
     @property
+    def turn(self) -> Literal["steering", "yaw_rate"]:
+        """What the second of its commands is."""
+        return "yaw_rate" if self.skid else "steering"
+
+    @property
     def vehicle(self) -> Vehicle:
         """At full size, by Froude's similarity; NumPy float32 leaves, which start no device."""
         x, y = self.wheelbase / 2, np.broadcast_to(self.track, 2) / 2
@@ -282,7 +288,7 @@ class VehicleConfig:
 def stack(vehicles: Sequence[Vehicle]) -> Vehicle:
     """Vehicles of any layouts as one with leaves `[N, ...]`, for `select`.
 
-    Raises `ValueError` for skid-steered vehicles among others.
+    Raises `UserError` for skid-steered vehicles among others.
     """
     every = [vars(vehicle) for vehicle in vehicles]
     plain = {"driven": _AXLES["all"], "locked": _AXLES["none"], "wheel_angle": (1, 1)}
@@ -290,7 +296,7 @@ def stack(vehicles: Sequence[Vehicle]) -> Vehicle:
     skids = [vehicle.skid for vehicle in vehicles if vehicle.skid is not None]
     if skids:
         if len(skids) < len(vehicles):
-            raise ValueError("expected skid-steered vehicles alone, or none among others")
+            raise UserError("vehicles: expected skid-steered ones alone, or none among others")
         leaves["skid"] = jax.tree.map(lambda *leaf: np.stack(leaf), *skids)
     for name in every[0].keys() - {"skid"}:
         given = [numbers[name] for numbers in every]

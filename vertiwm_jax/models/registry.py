@@ -6,7 +6,12 @@ from typing import Literal
 
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
+from vertiwm_jax.mechanics.kinematic import (
+    DifferentialDrive,
+    KinematicBicycle,
+    bicycle_of,
+    differential_of,
+)
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
 from vertiwm_jax.models import files
@@ -55,7 +60,10 @@ def load_model(
     if name == "builtin":
         return Simulator(), chrono_like(vehicle or load_vehicle())
     if name == "bicycle":
-        return KinematicBicycle(), bicycle_of(vehicle or load_vehicle())
+        driven = vehicle or load_vehicle()
+        if driven.skid is not None:
+            return DifferentialDrive(), differential_of(driven, driven.skid)
+        return KinematicBicycle(), bicycle_of(driven)
     folder = Path(weights or files.PRETRAINED)
     found = load_fitted(folder, soil, embeddings, exact_gradient)
     if name not in found:

@@ -142,7 +142,7 @@ def collect(config: CollectConfig) -> None:
             # Last, because by its file a world counts as done.
             wheels = driven.vehicle.wheel_position
             recorded = schema.in_file(arrays(drives, config.steps), terrain.offset(world))
-            schema.write(path, recorded, meta, wheels)
+            schema.write(path, recorded, meta, wheels, driven.turn)
     if done:
         _log.info("%s steps, %.0f a second", f"{done:,}", done / (time.monotonic() - began))
 
