@@ -16,7 +16,7 @@ POWER: dict[str, float] = {
     "free_travel": 1, "steering_limit": 0, "steering_rate": -0.5, "speed_gain": -0.5,
     "wheel_torque": 4, "wheel_power": 3.5, "wheel_speed_limit": -0.5, "brake_torque": 4,
     "tyre_friction": 0, "hull": 1, "length": 1, "width": 1, "driven": 0, "locked": 0,
-    "wheel_angle": 0,
+    "wheel_angle": 0, "reverse_torque": 4,
     "gain": 0, "speed_lag": 0.5, "turn_lag": 0.5, "slip_speed": 0.5,
     # Of a soil: its stresses grow as its depths do. For Bekker's moduli see `scaled`.
     "cohesion": 1, "shear_modulus": 1,

@@ -87,6 +87,7 @@ def test_a_data_sheet_counts_more_than_guesses():
     found = measured(described(WEAK, design=design), "it")
     assert found.spring == (1e5, 2e5) and found.damper == (1e4, 2e4)
     assert (found.wheel_torque, found.wheel_power, found.brake_torque) == (5e3, 3e4, 3e3)
+    assert found.reverse_torque == pytest.approx(0.43 * 5e3)
     assert found.drive == "rear" and found.hull == (1.0, 0.4, 0.1, 0.6)
 
 

@@ -153,6 +153,24 @@ def test_drives_backwards():
     assert radius == pytest.approx(float(VEHICLE.wheelbase) / np.tan(0.2), rel=0.08)
 
 
+def test_reverse_gear_may_have_a_torque_of_its_own():
+    flat, own = ground(), replace(load("hmmwv"), reverse_torque=1000.0)
+    start, vehicles = at_rest(flat), [own.vehicle, load("hmmwv").vehicle]
+    alone = drive(flat, start, -6.0, params=chrono_like(own.vehicle)).state.velocity[:, 0]
+    radius = own.wheel_radius
+    inertia = own.mass + 4 * own.wheel_inertia / radius**2
+    gained = (alone[7] - alone[2]) / 0.5
+    assert gained == pytest.approx(-4 * 1000 / radius / inertia, rel=0.05)
+    # Beside it, one without is driven as forward, as it is when it is alone.
+    several = stack(vehicles)
+    together, free = (
+        drive(flat, start, -6.0, params=chrono_like(vehicle)).state.velocity[:, 0]
+        for vehicle in (several.select(jnp.int32(1)), vehicles[1])
+    )
+    np.testing.assert_allclose(together, free, atol=1e-4)
+    assert free[2] < 2 * alone[2]
+
+
 @pytest.mark.parametrize(("before", "after"), [(6.0, -2.0), (-6.0, 2.0)])
 def test_brakes_until_the_gear_can_be_shifted(before, after):
     """With weak brakes, as a vehicle that uses its engine stops sooner."""

@@ -54,6 +54,7 @@ def test_a_rover_at_full_size_is_about_an_hmmwv():
         ("hull", [0.1, 0.1, 0.2, 0.1], "hull: expected half the length and half the width"),
         ("inertia", [1.0, 2.0, 9.0], "inertia: expected no moment larger than the sum"),
         ("wheels", 4, "wheels: unknown key"),
+        ("reverse_torque", 0.0, "reverse_torque: expected more than 0, found 0.0"),
         ("drive", "back", "drive: expected one of 'all', 'rear', 'front', found 'back'"),
         ("locked", "rear", "locked: expected none or front, as these wheels are driven"),
         ("wheel_radius", [0.5, 0.0], "wheel_radius: expected more than 0, found (0.5, 0.0)"),

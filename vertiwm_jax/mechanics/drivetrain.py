@@ -73,6 +73,9 @@ def actuate(
     mean_speed = jnp.maximum(jnp.abs(mean_speed), 1.0)
     torque = jnp.minimum(vehicle.wheel_torque, vehicle.wheel_power / mean_speed)
     torque = torque * jnp.clip(2 - 2 * mean_speed / vehicle.wheel_speed_limit, 0.0, 1.0)
+    if vehicle.reverse_torque is not None:
+        own = (gear < 0) & (vehicle.reverse_torque > 0)
+        torque = jnp.where(own, vehicle.reverse_torque, torque)
     if driven is not None:
         torque = torque * driven
     brake = vehicle.brake_torque / (jnp.abs(wheel_speed) + SPIN_FLOOR)

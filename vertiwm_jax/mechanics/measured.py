@@ -40,6 +40,9 @@ WHEEL_INERTIA = 0.9
 """Spin inertia of a wheel with its shafts, as a share of its mass times its radius squared."""
 STEERING_SECONDS = 0.1
 """Time from straight ahead to full lock."""
+REVERSE = 0.43
+"""Torque in reverse as a share of the most forward, of an HMMWV in Chrono, whose engine gives in
+reverse at any speed what it gives at rest."""
 ONE_AXLE = 0.7
 """Share of what friction lets all wheels give, below which a start is taken for that of a vehicle
 whose rear wheels alone are driven, where it is not known which are."""
@@ -88,6 +91,8 @@ def _measured(facts: Mapping[str, Any]) -> VehicleConfig:
     drive: Literal["all", "rear"] = "rear" if "rwd" in told else "all"
     driven, moved = {"all": 4, "rear": 2}[drive], mass + 4 * spin_inertia / size**2
     engine = moved * bench.gained / driven
+    # Tires that slip hide how strong an engine or a brake is: an HMMWV's are so by these factors.
+    torque = float(design.get("wheel_torque", bench.hidden(2.0) * engine.max() * size))
 
     angles = facts["front_angle"]
     half, full = (np.mean([abs(angles[side + u]) for side in ("", "-")]) for u in ("0.5", "1.0"))
@@ -114,9 +119,7 @@ def _measured(facts: Mapping[str, Any]) -> VehicleConfig:
         steering_limit=float(full),
         steering_rate=float(full / STEERING_SECONDS),
         speed_gain=float(facts["pedal_gain"]),
-        # Tires that slip hide how strong an engine or a brake is: those of an HMMWV are stronger by
-        # about these factors.
-        wheel_torque=float(design.get("wheel_torque", bench.hidden(2.0) * engine.max() * size)),
+        wheel_torque=torque,
         wheel_power=float(
             design.get("wheel_power", bench.hidden(1.25) * (engine * bench.speed).max())
         ),
@@ -128,6 +131,7 @@ def _measured(facts: Mapping[str, Any]) -> VehicleConfig:
         width=float(1.15 * track.mean()),
         drive=drive,
         wheel_angle=(float(2 * half / full), 1.0),
+        reverse_torque=REVERSE * torque,
     )
 
 

@@ -72,6 +72,8 @@ class Vehicle:
         differentials are open.
     wheel_angle: `[2]`, angle of the front wheels as a share of the commanded one, at half and at
         full lock, linear in the angle; None: they turn as commanded.
+    reverse_torque: `[]` N m a driven wheel in reverse gear, at any speed; None, or 0 of stacked
+        vehicles: as forward.
     """
 
     mass: jax.Array
@@ -99,6 +101,7 @@ class Vehicle:
     driven: jax.Array | None = None
     locked: jax.Array | None = None
     wheel_angle: jax.Array | None = None
+    reverse_torque: jax.Array | None = None
     skid: Skid | None = None
 
     @property
@@ -229,6 +232,8 @@ class VehicleConfig:
     """The axles whose wheels locked differentials bring to one speed; others have open ones."""
     wheel_angle: tuple[Positive, Positive] = (1.0, 1.0)
     """Angle of the front wheels as a share of the commanded one, at half and at full lock."""
+    reverse_torque: Positive | None = None
+    """N m a driven wheel in reverse gear, at any speed; null: as forward."""
     skid: SkidConfig | None = None
     """Of a skid-steered vehicle: no wheel turns, and its sides are driven to the speeds of the
     commanded speed and yaw rate. Without it, the front wheels steer."""
@@ -291,7 +296,10 @@ def stack(vehicles: Sequence[Vehicle]) -> Vehicle:
     Raises `UserError` for skid-steered vehicles among others.
     """
     every = [vars(vehicle) for vehicle in vehicles]
-    plain = {"driven": _AXLES["all"], "locked": _AXLES["none"], "wheel_angle": (1, 1)}
+    plain = {
+        **{"driven": _AXLES["all"], "locked": _AXLES["none"]},
+        **{"wheel_angle": (1, 1), "reverse_torque": 0},
+    }
     leaves: dict[str, Any] = {}
     skids = [vehicle.skid for vehicle in vehicles if vehicle.skid is not None]
     if skids:
