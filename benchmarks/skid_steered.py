@@ -5,6 +5,9 @@
 last is the yaw rate), `step` `[N]` and `meta` (wheel radius, wheelbase and track in m). Windows of
 one `step` have the same command, so intervals draw steps, not windows. Poses come at about 10 Hz
 and are held between: held ones are not counted where a state is estimated.
+
+The simulator has the numbers of the robot's file in `configs/vehicles`, which `--fit` finds again,
+within minutes: by least squares through it, with the first 30 windows, from guesses.
 """
 
 import json
@@ -15,6 +18,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from benchmarks._harness import Figures, parser, report
@@ -23,7 +27,10 @@ from vertiwm_jax.dynamics import Dynamics, Params, rollout
 from vertiwm_jax.evaluation.prediction import bootstrap
 from vertiwm_jax.geometry import wrap
 from vertiwm_jax.importers.commands import differential
+from vertiwm_jax.mechanics import vehicle as vehicles
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, DifferentialDrive, DifferentialParams
+from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
+from vertiwm_jax.mechanics.vehicle import Skid, Vehicle
 from vertiwm_jax.precision import float32
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
@@ -37,6 +44,16 @@ POSE_NOISE = 0.04  # m, of a pose from lidar
 WHEEL_NOISE = 0.15  # m/s, by which a vehicle is slower than 0.9 times its wheels
 WHEEL_SHARE = 0.9
 DRIFT = 0.3  # m/s sideways that are usual
+GUESSES = {
+    "husky": (0.6, 0.3, 1.5, 4.0, 15.0, 0.2, 0.5, 9.0, 0.0),
+    "warthog": (0.6, 1.0, 1.0, 1.0, 150.0, 0.4, 0.8, 17.0, 0.0),
+}
+"""Where `--fit` begins, by robot: the numbers that `VehicleNumbers` lists."""
+DEVIATIONS = np.array([0.3, 0.7, 0.3, 0.7, 0.5, 0.7, 0.7, 0.5, 1.0])
+"""How far off guesses usually are: of the logarithms, of the place of the mass in tenths of the
+wheelbase."""
+NOISE = {"husky": 0.15, "warthog": 0.35}
+"""m by which predictions err after 1.6 s."""
 FREE = "speed_gain", "turn_gain", "speed_lag", "turn_lag", "offset", "drift"
 
 
@@ -55,6 +72,7 @@ class Logs:
     gyro: np.ndarray
     step: np.ndarray
     geometry: tuple[float, float, float]
+    name: str
 
     @classmethod
     def of(cls, path: Path) -> "Logs":
@@ -75,6 +93,7 @@ class Logs:
             gyro=found["imu"][..., 3].astype(float),
             step=found["step"],
             geometry=(robot["wheelbase"], track, radius),
+            name=robot["name"],
         )
 
     @cached_property
@@ -87,7 +106,7 @@ class Logs:
         """Some of the windows."""
         arrays = {k: x[rows] for k, x in vars(self).items() if isinstance(x, np.ndarray)}
         arrays.pop("fresh", None)
-        return Logs(**arrays, geometry=self.geometry)
+        return Logs(**arrays, geometry=self.geometry, name=self.name)
 
     @property
     def commands(self) -> Command:
@@ -175,6 +194,82 @@ def fitted(
     return of(found.x)
 
 
+def numbered(numbers: ArrayLike, vehicle: Vehicle) -> Vehicle:
+    """The vehicle with `[9]` numbers: friction, slip speed, gain, pedal per speed, torque, lags of
+    speed and turn, largest wheel speed, and the place of the mass ahead of the middle, m."""
+    friction, slip, gain, pedal, torque, of_speed, of_turn, limit, ahead = jnp.asarray(numbers)
+    return replace(
+        vehicle,
+        tyre_friction=friction,
+        speed_gain=pedal,
+        wheel_torque=torque,
+        brake_torque=torque,
+        wheel_speed_limit=limit,
+        centre_of_mass=jnp.asarray(vehicle.centre_of_mass).at[0].set(ahead),
+        skid=Skid(gain, of_speed, of_turn, slip),
+    )
+
+
+@float32
+@jax.jit
+def simulated(
+    vehicle: Vehicle, ground: TerrainMap, state: VehicleState, wheel: jax.Array, commands: Command
+) -> VehicleState:
+    """`[N, 16, 3]` states in the built-in simulator, from measured wheel speeds `[N, 2]`."""
+    simulator, params = Simulator(), chrono_like(vehicle)
+
+    def one(state: VehicleState, wheel: jax.Array, commands: Command) -> VehicleState:
+        height = state.position.at[2].set(vehicle.ride_height)
+        state = replace(state, position=height)
+        history = simulator.init(params, ground, state)
+        rim = wheel[0] - wheel[1] * vehicle.wheel_position[:, 1]
+        gain = vehicle.skid.gain if vehicle.skid is not None else 1.0
+        told = wheel / gain
+        spin = rim / vehicle.wheel_radius
+        history = replace(history, wheel_speed=spin, speed=told[0], steering=told[1])
+        return rollout(simulator, params, ground, state, commands, history)
+
+    return jax.vmap(one)(state, wheel, commands)
+
+
+def fitted_vehicle(
+    vehicle: Vehicle, ground: TerrainMap, state: VehicleState, logs: Logs
+) -> tuple[np.ndarray, np.ndarray]:
+    """`[9]` numbers of `numbered` that predict windows best, and 90 % intervals `[9, 2]`."""
+    guess, steps = np.array(GUESSES[logs.name]), np.array([4, 8, 12, 16])
+    truth = np.dstack([logs.xy, logs.yaw])[:, START + 2 * steps]
+    reach = 1.0 if logs.name == "warthog" else 0.7
+    weight = 1 / (NOISE[logs.name] * (0.15 + 0.85 * steps / STEPS))
+    weight = weight[:, None] * np.array([1, 1, reach])
+    wheel = jnp.asarray(logs.wheel[:, START], jnp.float32)
+
+    def of(changes: jax.Array) -> jax.Array:
+        ahead = guess[-1] + changes[-1] * logs.geometry[0] / 10
+        return jnp.append(guess[:-1] * jnp.exp(changes[:-1]), ahead)
+
+    @jax.jit
+    def misses(changes: jax.Array) -> jax.Array:
+        found = simulated(numbered(of(changes), vehicle), ground, state, wheel, logs.commands)
+        xy, yaw = found.position[:, steps - 1, :2], found.rpy[:, steps - 1, 2]
+        off = jnp.dstack([xy - truth[..., :2], wrap(yaw - truth[..., 2])])
+        return (off * weight).ravel()
+
+    slopes = jax.jit(jax.jacfwd(misses))
+
+    def residual(changes: np.ndarray) -> np.ndarray:
+        return np.append(np.asarray(misses(jnp.float32(changes))), changes / DEVIATIONS)
+
+    def jacobian(changes: np.ndarray) -> np.ndarray:
+        return np.vstack([np.asarray(slopes(jnp.float32(changes))), np.diag(1 / DEVIATIONS)])
+
+    found = least_squares(
+        residual, 0 * guess, jacobian, loss="soft_l1", max_nfev=25, xtol=1e-3, ftol=1e-4
+    )
+    half = 1.645 * np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    ends = [np.asarray(of(jnp.float32(found.x + side * half))) for side in (-1, 1)]
+    return np.asarray(of(jnp.float32(found.x))), np.stack(ends, axis=1)
+
+
 def figures(error: np.ndarray, logs: Logs) -> Figures:
     """Mean errors with 95 % intervals over steps; also where the last pose is no held one."""
     row: dict[str, float] = {}
@@ -189,7 +284,7 @@ def figures(error: np.ndarray, logs: Logs) -> Figures:
     return row
 
 
-def rows(path: Path) -> dict[str, Figures]:
+def rows(path: Path, fit: bool = False) -> dict[str, Figures]:
     """Figures of each model, by name; but for the last of each state, on windows not fitted to."""
     logs = Logs.of(path)
     ground = TerrainMap.from_array(np.zeros((9, 9)), "concrete", resolution=8.0)
@@ -210,14 +305,26 @@ def rows(path: Path) -> dict[str, Figures]:
         for name, (model, params, state, tested) in cases.items():
             last = predicted(model, params, ground, state, tested.commands)
             made[f"{path.stem}: {name} ({told})"] = figures(errors(last, tested), tested)
+        if sensors and logs.name in GUESSES:
+            robot = replace(vehicles.load(logs.name), scale=1.0).vehicle
+            if fit:
+                numbers, ends = fitted_vehicle(robot, ground, begin, first)
+                robot = numbered(numbers, robot)
+                for number, (low, high) in zip(numbers, ends, strict=True):
+                    print(f"{number:.4g} ({low:.4g} to {high:.4g})")
+            wheel = jnp.asarray(others.wheel[:, START], jnp.float32)
+            driven = simulated(robot, ground, begins, wheel, others.commands)
+            last = jax.tree.map(lambda x: x[:, -1], driven)
+            made[f"{path.stem}: simulator ({told})"] = figures(errors(last, others), others)
     return made
 
 
 def main() -> None:
     arguments = parser(__doc__)
     arguments.add_argument("logs", nargs="+", type=Path, help="files of windows, one a robot")
+    arguments.add_argument("--fit", action="store_true", help="find the robots' numbers again")
     chosen = arguments.parse_args()
-    results = {name: row for path in chosen.logs for name, row in rows(path).items()}
+    results = {k: row for path in chosen.logs for k, row in rows(path, chosen.fit).items()}
     report("skid_steered", results, chosen.json)
 
 

@@ -31,7 +31,7 @@ def written(path, windows=12):
 
     imu = np.repeat([[0, 0, 9.81, 0]], 40, axis=0) + np.zeros((windows, 40, 4))
     imu[..., 3] = turn[:, None] / 3
-    meta = {"vehicle": {"wheelbase": 0.5, "track": TRACK, "wheel_radius": RADIUS}}
+    meta = {"vehicle": {"wheelbase": 0.5, "track": TRACK, "wheel_radius": RADIUS, "name": "husky"}}
     np.savez(
         path,
         pose=pose,
@@ -69,6 +69,8 @@ def test_errors_are_told_by_model_with_intervals_over_steps(tmp_path, monkeypatc
     # What is held for a sample of 0.05 s is up to that late.
     assert fitted["position_m"] < 0.06
     assert made["robot: differential drive without slip (poses)"]["yaw_rad"] > 0.3
+    # The numbers of a Husky, which this robot is not.
+    assert 0 < made["robot: simulator (poses, wheels, gyroscope)"]["position_m"] < 1.0
 
 
 def test_the_predicted_pose_is_that_at_the_last_sample(tmp_path):
