@@ -13,8 +13,15 @@ import benchmarks
 from benchmarks._harness import cell
 from vertiwm_jax import atomic
 
-_APART = {"gpu", "recurrent_baseline", "skid_steered", "soil_adaptation", "turns"}
-"""Those that need a GPU or recorded drives; and what runs another one."""
+_APART = {
+    "gpu",
+    "measured_wheels",
+    "recurrent_baseline",
+    "skid_steered",
+    "soil_adaptation",
+    "turns",
+}
+"""Those that need a GPU, recorded drives or trials; and what runs another one."""
 _NEEDS = {
     "chrono": ("pychrono", "see docs/collect.md"),
     "torch_peer": ("torch", 'pip install -e ".[peers]"'),

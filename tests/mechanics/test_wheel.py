@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 
 from vertiwm_jax import froude
-from vertiwm_jax.mechanics.bekker_wong import BekkerWongParams, travel
+from vertiwm_jax.mechanics.bekker_wong import LUGGED_WHEEL, BekkerWongParams, travel
 from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
 from vertiwm_jax.mechanics.wheel import Wheel, rigid_forces
 from vertiwm_jax.terrain.soil import PRESETS, stack
@@ -123,6 +123,7 @@ def test_agrees_with_adaptive_quadrature():
     [
         BekkerWongParams(rebound=0.9, slip_sinkage=0.2, skid_sinkage=0.3),
         BekkerWongParams(bulldozing="wong"),
+        LUGGED_WHEEL,
     ],
 )
 @pytest.mark.integration
@@ -153,6 +154,23 @@ def test_values_and_gradients_are_finite_in_every_corner(contact):
     assert all(not np.any(x[airborne]) for x in gradient[3:])
 
 
+def test_sliding_straight_to_the_side_knows_no_ahead():
+    soil = jax.tree.map(lambda x: x[0], SOILS)
+    # Locked; then spinning forwards and backwards.
+    f = run(WHEEL, soil, LUGGED_WHEEL, 0.1, 0.0, -2.0, np.array([0.0, 8.0, -8.0]))
+    np.testing.assert_allclose(f.longitudinal[0], 0, atol=1e-3 * f.normal[0])
+    np.testing.assert_allclose(f.longitudinal[1], -f.longitudinal[2], rtol=1e-5)
+    np.testing.assert_allclose(f.normal[1], f.normal[2], rtol=1e-5)
+    assert f.longitudinal[1] > 0 and (f.lateral > 0).all()
+
+
+def test_sliding_softens_soil():
+    soil = jax.tree.map(lambda x: x[0], SOILS)
+    aside, spin = np.float32([0.0, -1.0, -4.0, 0.0, 0.0]), np.float32([1, 1, 1, 4, 0]) / 0.467
+    z = equilibrium_sinkage(WHEEL, soil, LUGGED_WHEEL, 6e3, (1.0, aside, spin))
+    assert z[0] < z[1] < z[2] and z[0] < z[3] and z[0] < z[4]
+
+
 @pytest.mark.integration
 def test_gradients_agree_with_differences():
     soil = jax.tree.map(lambda x: x[0], SOILS)
@@ -173,10 +191,11 @@ def test_gradients_agree_with_differences():
         np.testing.assert_allclose(forward[..., i], difference, rtol=0.03, atol=0.01 * scale)
 
 
-def test_reversing_mirrors_driving():
+@pytest.mark.parametrize("contact", [BekkerWongParams(), LUGGED_WHEEL])
+def test_reversing_mirrors_driving(contact):
     soil = jax.tree.map(lambda x: x[0], SOILS)
-    there = run(WHEEL, soil, BekkerWongParams(), 0.04, 3.0, 0.5, 8.0)
-    back = run(WHEEL, soil, BekkerWongParams(), 0.04, -3.0, 0.5, -8.0)
+    there = run(WHEEL, soil, contact, 0.04, 3.0, 0.5, 8.0)
+    back = run(WHEEL, soil, contact, 0.04, -3.0, 0.5, -8.0)
     np.testing.assert_allclose(back.longitudinal, -there.longitudinal, rtol=1e-6)
     np.testing.assert_allclose(back.torque, -there.torque, rtol=1e-6)
     np.testing.assert_allclose([back.lateral, back.normal], [there.lateral, there.normal])

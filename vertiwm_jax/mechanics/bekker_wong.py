@@ -38,6 +38,34 @@ _MAX_PEAK = 0.98  # of th1; the peak stays inside the contact
 
 
 @struct.dataclass
+class Ploughing:
+    """What sliding does to the contact `[...]`; coefficients are dimensionless.
+
+    s is the slip of the rim against the hub's whole speed V, positive when driven: 1 - V/(r w)
+    driven, r w/V - 1 braked. vx and vy are the hub's velocity along and across the wheel.
+
+    soft_aside, soft_slip, soft_skid: Bekker's pressure is divided by 1 + soft_aside
+        |vy| / (vx^2 + (forward V)^2)^1/2 + soft_slip s driven + soft_skid s^2 |vx| / V braked:
+        soil yields the more, the farther it is sheared while the wheel passes over it.
+    peak_aside, peak_skid: added to thm: peak_aside |vy| / max(V, r w) of th1, and braked
+        - peak_skid s |vx| / V of sin th1; peak_slip takes this s too.
+    forward: share of V along the wheel below which ahead and behind become alike: thm tends to
+        0 and th2 to -th1 where a wheel slides straight to its side.
+    side, side_slip: the passive pressure of the soil columns along the flank, on its height under
+        the undisturbed surface, times side (1 - side_slip s) driven.
+    """
+
+    soft_aside: Float
+    soft_slip: Float
+    soft_skid: Float
+    peak_aside: Float
+    peak_skid: Float
+    forward: Float
+    side: Float
+    side_slip: Float
+
+
+@struct.dataclass
 class BekkerWongParams:
     """Empirical coefficients of wheel-soil contact `[...]`; s is slip, positive when driven.
 
@@ -48,6 +76,8 @@ class BekkerWongParams:
     unload_stiffness: k0 in Pa/m of Wong's unloading and reloading p = p_u - k0 (z_u - z); stiff
         enough to be felt in a rut only.
     creep_speed: m/s below which shear fades out, so that a standing wheel has smooth forces.
+    ploughing: of a wheel that slides far, also sideways; without it the contact is that of the
+        other coefficients alone. It has a side pressure of its own in place of `bulldozing`.
     bulldozing: pressure on the wheel's side, "ishigami" (2007) or "wong" (2008).
     nodes: of Gauss-Legendre's rule in each of the five pieces of the contact.
     """
@@ -61,6 +91,7 @@ class BekkerWongParams:
     skid_sinkage: Float = 0.0
     unload_stiffness: Float = 2e8
     creep_speed: Float = 0.05
+    ploughing: Ploughing | None = None
     bulldozing: Literal["ishigami", "wong"] = struct.field(pytree_node=False, default="ishigami")
     nodes: int = struct.field(pytree_node=False, default=6)
 
@@ -80,7 +111,7 @@ class BekkerWongParams:
         m = travel(wheel, contact.creep_speed, motion)
         n = soil.n + contact.slip_sinkage * jnp.maximum(m.slip, 0.0)
         n = n + contact.skid_sinkage * jnp.maximum(-m.slip, 0.0)
-        keq = soil.kc / wheel.width + soil.kphi
+        keq = (soil.kc / wheel.width + soil.kphi) * bearing(contact, m)
         floor, unload = reloading(contact, keq, n, rut)
 
         depth, touching = depth_below(floor, sinkage, wheel)
@@ -121,6 +152,40 @@ COMPACT_SAND = BekkerWongParams(peak=0.43, peak_slip=0.32)
 """Wong and Reece (1967)."""
 LOOSE_SAND = BekkerWongParams(peak=0.18, peak_slip=0.32)
 """Wong and Reece (1967)."""
+SMOOTH_WHEEL = BekkerWongParams(
+    peak=0.245,
+    peak_slip=-0.122,
+    exit=-0.230,
+    ploughing=Ploughing(
+        soft_aside=2.27,
+        soft_slip=3.98,
+        soft_skid=3.66,
+        peak_aside=0.256,
+        peak_skid=0.639,
+        forward=0.0402,
+        side=1.71,
+        side_slip=0.399,
+    ),
+)
+"""A smooth wheel, in the soil "sand_smooth_wheel": fitted to trials at slip angles of 0 to 90
+degrees and slips of -1 to 0.9 (Pavlov and Johnson 2024) by `benchmarks.measured_wheels`. Wheels as
+slow as theirs (0.01 m/s) need a `creep_speed` far below their speed."""
+LUGGED_WHEEL = BekkerWongParams(
+    peak=0.276,
+    peak_slip=-0.325,
+    exit=-0.260,
+    ploughing=Ploughing(
+        soft_aside=2.35,
+        soft_slip=7.50,
+        soft_skid=3.38,
+        peak_aside=0.253,
+        peak_skid=0.498,
+        forward=0.0356,
+        side=1.74,
+        side_slip=-0.0736,
+    ),
+)
+"""The same with lugs of 5 mm, in "sand_lugged_wheel". The radius ends at half their height."""
 
 
 class Travel(NamedTuple):
@@ -138,6 +203,23 @@ class Travel(NamedTuple):
     spin: jax.Array
     rolling: jax.Array
     slip: jax.Array
+
+
+class Sliding(NamedTuple):
+    """The same motion beside the hub's whole speed: what `Ploughing` is a function of.
+
+    driven, braked: slip of the rim against the whole speed, both in [0, 1]. along, aside: shares
+    of the whole speed along and across the wheel. sweep: m across per m along, bounded.
+    forward: 1, fading to 0 where the hub moves across the wheel alone. lateral: across, as a
+    share of the faster of rim and hub.
+    """
+
+    driven: jax.Array
+    braked: jax.Array
+    along: jax.Array
+    sweep: jax.Array
+    forward: jax.Array
+    lateral: jax.Array
 
 
 class Patch(NamedTuple):
@@ -176,16 +258,53 @@ def travel(wheel: Wheel, creep_speed: Float, motion: Motion) -> Travel:
     )
 
 
+def sliding(ploughing: Ploughing, creep_speed: Float, m: Travel) -> Sliding:
+    """Slips `[...]` beside the whole speed; values and gradients are finite everywhere."""
+    squared = jnp.square(m.hub) + jnp.square(m.lateral) + jnp.square(creep_speed)
+    speed = jnp.sqrt(squared)
+    faster = jnp.maximum(speed, jnp.abs(m.rim))
+    slip = (m.rim - speed) / faster
+    ahead = jax.lax.rsqrt(jnp.square(m.hub) + squared * jnp.square(ploughing.forward))
+    across = jnp.abs(m.lateral)
+    return Sliding(
+        driven=jnp.maximum(slip, 0.0),
+        braked=jnp.clip(-slip, 0.0, 1.0),
+        along=jnp.abs(m.hub) / speed,
+        sweep=across * ahead,
+        forward=jnp.abs(m.hub) * ahead,
+        lateral=across / faster,
+    )
+
+
+def bearing(contact: BekkerWongParams, m: Travel) -> Float:
+    """Share of Bekker's moduli that soil keeps under a wheel that slides."""
+    if contact.ploughing is None:
+        return 1.0
+    q, a = contact.ploughing, sliding(contact.ploughing, contact.creep_speed, m)
+    softer = q.soft_aside * a.sweep + q.soft_skid * jnp.square(a.braked) * a.along
+    return 1 / (1 + softer + q.soft_slip * a.driven)
+
+
 def patch(contact: BekkerWongParams, depth: jax.Array, m: Travel) -> Patch:
     """Where a wheel touches soil at `depth`, in wheel radii."""
     driven, braked = jnp.maximum(m.slip, 0.0), jnp.maximum(-m.slip, 0.0)
     entry = contact_angle(depth)
-    peak = (contact.peak + contact.peak_slip * driven) * entry
     # Pavlov (2024): continuous from driving to braking.
     reversal = (1 - braked / 2) * entry
-    peak = jnp.minimum(peak, _MAX_PEAK * entry)
     rebound = contact_angle(contact.rebound * depth)
-    leave = (contact.exit + contact.exit_slip * driven) * entry - rebound
+    ploughing = contact.ploughing
+    if ploughing is None:
+        peak = (contact.peak + contact.peak_slip * driven) * entry
+        peak = jnp.minimum(peak, _MAX_PEAK * entry)
+        leave = (contact.exit + contact.exit_slip * driven) * entry - rebound
+    else:
+        a = sliding(ploughing, contact.creep_speed, m)
+        peak = contact.peak + contact.peak_slip * a.driven + ploughing.peak_aside * a.lateral
+        # By the sine: a locked wheel that sinks deep still stands on what is below it.
+        peak = peak * entry + ploughing.peak_skid * a.braked * a.along * jnp.sin(entry)
+        peak = a.forward * jnp.clip(peak, 0.0, _MAX_PEAK * entry)
+        leave = (contact.exit + contact.exit_slip * a.driven) * entry - rebound
+        leave = a.forward * leave - (1 - a.forward) * entry
     return Patch(entry, peak, jnp.minimum(leave, peak), reversal)
 
 
@@ -284,6 +403,13 @@ def bulldozing(
     sin_slip_angle = -m.lateral * jax.lax.rsqrt(m.hub**2 + m.lateral**2 + contact.creep_speed**2)
     tangent = jnp.tan(soil.friction_angle)
     cotangent = jnp.tan(jnp.pi / 4 + soil.friction_angle / 2)  # of Xc; equals tan(Xc + phi)
+    if contact.ploughing is not None:
+        driven = sliding(contact.ploughing, contact.creep_speed, m).driven
+        share = contact.ploughing.side * (1 - contact.ploughing.side_slip * driven)
+        height = radius * jnp.maximum(at.cos - jnp.cos(p.entry), 0.0)
+        d2 = cotangent + cotangent**2 * tangent
+        pressure = 2 * cotangent * height * (soil.cohesion + d2 * soil.unit_weight * height / 2)
+        return share * pressure * jnp.maximum(at.cos, 0.0) * sin_slip_angle
     if contact.bulldozing == "ishigami":
         below = radius * jnp.maximum(at.cos - jnp.cos(p.entry), 0.0)
         d2 = cotangent + cotangent**2 * tangent

@@ -66,6 +66,11 @@ PRESETS: dict[str, Soil] = {
     "snow_sweden": _soil(10.55, 66.08, 1.44, 6, 20.7, 0.04, 3),
     # Lunar regolith: Wong (2008) table 2.3 and Apollo Lunar Sourcebook; 1.55 t/m3 at 1.62 m/s2.
     "lunar": _soil(1.4, 820, 1.0, 0.17, 35, 0.018, 2.5),
+    # Fitted to the trials of Pavlov and Johnson (2024) by `benchmarks.measured_wheels`, each
+    # together with the contact of its name in `mechanics.bekker_wong`; friction and cohesion are
+    # those between wheel and sand. Moduli are of wheels 50 mm wide, rho g as measured.
+    "sand_smooth_wheel": _soil(0, 14490, 1.487, 0.973, 14.0, 0.00503, 13.03),
+    "sand_lugged_wheel": _soil(0, 16600, 1.557, 0.354, 23.7, 0.00959, 13.03),
 }
 
 
