@@ -33,6 +33,8 @@ class ModelConfig:
     """What the Transformer is told of the ground; less than patches only to compare with."""
     soil: SoilSource = "map"
     """Whether NeSAM uses the soils of the map or predicts them from what the ground looks like."""
+    reads_vehicle: bool = False
+    """Whether specialists are told what the vehicle is, for a model of many vehicles."""
     encoders: Literal["own", "shared"] = "own"
     """Own ones for each specialist, as in the paper, or one pair that both share: half the cost
     where both learn from the same ground."""
@@ -55,12 +57,12 @@ class ModelConfig:
     @property
     def transformer(self) -> Transformer:
         """The specialist for rigid ground."""
-        return Transformer(_SIZES[self.size], self.terrain)
+        return Transformer(_SIZES[self.size], self.terrain, self.reads_vehicle)
 
     @property
     def nesam(self) -> Nesam:
         """The specialist for soil."""
-        return Nesam(_SIZES[self.size])
+        return Nesam(_SIZES[self.size], reads_vehicle=self.reads_vehicle)
 
     @property
     def verti_wm(self) -> VertiWM:
