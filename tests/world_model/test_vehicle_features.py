@@ -60,4 +60,4 @@ def test_a_specialist_that_is_told_moves_another_vehicle_otherwise(kind, reads):
 
     apart = np.abs(proposed(1.0) - proposed(2.0)).max()
     assert (apart > 1e-5) == reads, apart
-    assert vehicle_features.SIZE == described(HMMWV).size
+    assert described(HMMWV).size == vehicle_features.SIZE

@@ -57,4 +57,3 @@ def _numbers(vehicle: Vehicle) -> jax.Array:
     ]
     both = [jnp.concatenate([jnp.ravel(x) for x in group]) for group in (signed, positive)]
     return jnp.concatenate([both[0], jnp.log(both[1])])
-
