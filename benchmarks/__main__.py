@@ -15,13 +15,14 @@ from vertiwm_jax import atomic
 
 _APART = {
     "gpu",
+    "identification",
     "measured_wheels",
     "recurrent_baseline",
     "skid_steered",
     "soil_adaptation",
     "turns",
 }
-"""Those that need a GPU, recorded drives or trials; and what runs another one."""
+"""Those that need a GPU, recorded drives, trials or minutes; and what runs another one."""
 _NEEDS = {
     "chrono": ("pychrono", "see docs/collect.md"),
     "torch_peer": ("torch", 'pip install -e ".[peers]"'),

@@ -3,19 +3,25 @@
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
-from vertiwm_jax import atomic
+from vertiwm_jax import atomic, figures
 from vertiwm_jax import config as configuration
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import AtLeastOne, Count, settings
+from vertiwm_jax.evaluation import plots
+from vertiwm_jax.evaluation.tables import Row, markdown
 from vertiwm_jax.learning import identification
+from vertiwm_jax.learning.identification import MASS, Identified
 from vertiwm_jax.mechanics.vehicle import HMMWV
+from vertiwm_jax.state import STEP_SECONDS
 
 
 @settings
 class Identify:
-    """Find numbers of a vehicle with which the built-in simulator predicts its drives best."""
+    """Find numbers of a vehicle with which the built-in simulator predicts its drives best, and how
+    well drives tell them."""
 
     drives: tyro.conf.Positional[Annotated[tuple[Path, ...], AtLeastOne]]
     """Folders of drives, as `collect` and `import_drives` write them."""
@@ -27,13 +33,44 @@ class Identify:
     """Which of its numbers to find."""
     horizon: Count = 16
     """Steps of 0.1 s that are predicted."""
+    picture: Path | None = None
+    """File of a picture to write: numbers with their intervals, and errors before and after."""
 
 
 def run(name: str, words: list[str]) -> None:
     command = arguments.read(Identify, name, words)
-    atomic.expect_file(command.output)
+    for path in (command.output, command.picture):
+        if path is not None:
+            atomic.expect_file(path)
     asked = {"free": command.free, "horizon": command.horizon}
     found = identification.identify(command.drives, command.vehicle, **asked)
-    atomic.write(command.output, configuration.dump(found))
+    atomic.write(command.output, configuration.dump(found.vehicle))
+    if command.picture is not None:
+        figures.save(plots.identified(found), command.picture)
+    print("\n".join(_told(found)))
     print(f"the vehicle is in {command.output}; to train with it:")
     print(f"python -m vertiwm_jax.ppo --model builtin --vehicle {command.output}")
+
+
+def _told(found: Identified) -> list[str]:
+    rows: list[Row] = [
+        {
+            "number": number.name,
+            "factor to what was given": f"{number.factor:.2f} ({number.low:.2f}-{number.high:.2f})",
+            "given": f"1.00 ({1 / number.prior:.2f}-{number.prior:.2f})",
+            "beside the mass": "{:.2f}-{:.2f}".format(*number.ratio) if number.ratio else "",
+            "told by drives": "hardly" if number.told < 1 / 3 else f"{number.told:.0%}",
+        }
+        for number in found.numbers
+    ]
+    seconds = len(found.before) * STEP_SECONDS
+    delay, low, high = found.delay
+    return [
+        markdown(rows),
+        "",
+        "90 % intervals. Drives tell forces and moments of inertia only beside the mass, which was "
+        f"taken as given, to {np.expm1(identification.NINETY * MASS):.0%}.",
+        f"Commands act {delay:.2f} s late ({low:.2f}-{high:.2f}).",
+        f"Position error after {seconds:.1f} s: {found.before[-1]:.3f} m with what was given, "
+        f"{found.after[-1]:.3f} m with what was found.",
+    ]

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from vertiwm_jax.learning.identification import Identified
+
 Curves = Mapping[str, "tuple[ArrayLike, ArrayLike]"]
 """x and y of lines, by name."""
 _MARK: dict[str, Any] = {"color": "black", "markeredgecolor": "white", "linestyle": "none"}
@@ -127,6 +129,37 @@ def trajectories(
         handles.sort(key=lambda line: line.get_label() not in drives)
         legend = [*handles, *picture.ground_legend(terrain, [world])]
         figure.legend(handles=legend, loc="outside upper center", ncols=4)
+    return figure
+
+
+def identified(found: Identified) -> Figure:
+    """Draws numbers of a vehicle with 90 % intervals beside those before, and position errors."""
+    with figures.style():
+        figure = figures.sheet(9.0, 3.4)
+        left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
+        for row, number in enumerate(found.numbers):
+            known = row == 0
+            given = (1 / number.prior, number.prior)
+            left.plot(given, (row, row), color="0.8", linewidth=7, label="given" if known else None)
+            color, _ = figures.line(0)
+            left.plot((number.low, number.high), (row, row), color=color, linewidth=2.5)
+            label = "found" if known else None
+            left.plot(number.factor, row, "o", color=color, markersize=5, label=label)
+        left.set(
+            xscale="log",
+            xlabel="factor to what was given, with 90 % intervals",
+            yticks=range(len(found.numbers)),
+            yticklabels=[number.name for number in found.numbers],
+        )
+        left.set_xticks((ticks := (0.25, 0.5, 1.0, 2.0, 4.0)), [f"{tick:g}" for tick in ticks])
+        left.minorticks_off()
+        left.invert_yaxis()
+        for i, (name, error) in enumerate({"given": found.before, "found": found.after}.items()):
+            color, dash = figures.line(1 - i)
+            right.plot(*timed(error, 1), dash, color=color, label=f"numbers as {name}")
+        right.set(xlabel="time [s]", ylabel="position error [m]", ylim=(0, None))
+        for axes in (left, right):
+            axes.legend(loc="best")
     return figure
 
 

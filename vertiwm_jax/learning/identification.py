@@ -52,10 +52,11 @@ _MOST_WINDOWS = 512
 _STEP = 0.1  # deviations by which numbers are changed to see what they do
 _ROUNDS = 4  # of weighing windows
 _CRASH = 2.4  # misses, in typical ones, from which a window counts little (Cauchy)
-_NINETY = 1.645  # standard deviations on each side of a 90 % interval
+NINETY = 1.645
+"""Standard deviations on each side of a 90 % interval."""
 _NOISE = (0.005, 0.002, 0.01, 0.01)  # m, rad, m/s and rad/s that recorded states may be off
 _DRAWS = 6  # of such noise
-_SURE = 0.03  # standard deviation of a logarithm that is left however many drives there are
+_SURE = 0.06  # standard deviation of a logarithm that is left however many drives there are
 _FLOOR = 1e-3  # m, below which no miss is told from another
 Misses = Callable[[np.ndarray], np.ndarray]
 _log = logging.getLogger(__name__)
@@ -166,8 +167,8 @@ def identify(
         own, of_mass = np.hypot(prior * left, _SURE), name in OF_MASS
         wide = _interval(factor, np.hypot(own, MASS) if of_mass else own)
         ratio = _interval(factor, own) if of_mass else None
-        numbers.append(Number(name, float(factor), *wide, float(np.exp(_NINETY * prior)), ratio))
-    ends = away[-1] + _NINETY * deviations[-1] * np.array([0, -1, 1])
+        numbers.append(Number(name, float(factor), *wide, float(np.exp(NINETY * prior)), ratio))
+    ends = away[-1] + NINETY * deviations[-1] * np.array([0, -1, 1])
     found, low, high = (_delay(late, x) for x in ends.tolist())
     return Identified(changed(factors), tuple(numbers), (found, low, high), before, after)
 
@@ -216,10 +217,13 @@ def _posterior(misses: Misses, blur: Misses, numbers: int) -> tuple[np.ndarray, 
             found = [weighted(away + step) - weighted(away - step) for step in steps]
             return np.stack(found, axis=-1) / (2 * _STEP)
 
+        def all_slopes(away: np.ndarray, slopes=slopes) -> np.ndarray:
+            return np.vstack([slopes(away).reshape(-1, numbers), prior])
+
         found = least_squares(
             lambda away, weighted=weighted: np.append(weighted(away), away),
             found,
-            lambda away, slopes=slopes: np.vstack([slopes(away).reshape(-1, numbers), prior]),
+            all_slopes,  # pyright: ignore[reportArgumentType]
             xtol=1e-3,
             ftol=1e-4,
             max_nfev=8,
@@ -230,7 +234,7 @@ def _posterior(misses: Misses, blur: Misses, numbers: int) -> tuple[np.ndarray, 
 
 def _interval(factor: float, deviation: float) -> tuple[float, float]:
     """The ends of a 90 % interval, where the logarithm has this standard deviation."""
-    wide = np.exp(_NINETY * deviation)
+    wide = np.exp(NINETY * deviation)
     return float(factor / wide), float(factor * wide)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle, load_vehicle
 
-SIZE = 24
+SIZE = 26
 """Numbers of a vehicle."""
 MOST = 2.0
 """Where features are cut off: of vehicles that differ more from the HMMWV, little is known."""
@@ -35,7 +35,7 @@ def _numbers(vehicle: Vehicle) -> jax.Array:
     positive = [
         vehicle.wheelbase / radius,
         vehicle.track / radius,
-        vehicle.wheel_width / radius,
+        jnp.mean(vehicle.wheel_width) / radius,
         vehicle.mass / radius**3,
         vehicle.inertia / (vehicle.mass * radius**2),
         vehicle.spring[::2] * radius / weight,
@@ -49,7 +49,11 @@ def _numbers(vehicle: Vehicle) -> jax.Array:
         vehicle.tyre_friction,
         radius,
     ]
+    driven = jnp.ones(4) if vehicle.driven is None else vehicle.driven
+    locked = jnp.zeros(4) if vehicle.locked is None else vehicle.locked
     signed = [
+        jnp.mean(driven[:2]) - jnp.mean(driven[2:]),
+        jnp.mean(locked),
         vehicle.centre_of_mass[::2] / radius,
         vehicle.ride_height / radius,
         jnp.min(vehicle.hull[:, 2]) / radius,

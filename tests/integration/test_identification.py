@@ -1,4 +1,5 @@
 import json
+import shutil
 from dataclasses import replace
 
 import jax
@@ -10,6 +11,7 @@ import vertiwm_jax as vw
 from vertiwm_jax import cli
 from vertiwm_jax import config as configuration
 from vertiwm_jax.config import ConfigError
+from vertiwm_jax.learning.identification import MASS, NINETY
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
@@ -48,13 +50,42 @@ def drives(tmp_path_factory):
     return folder
 
 
-def test_a_number_is_found_from_drives(drives, tmp_path):
-    true = 1.6 * vehicle.load("hmmwv").speed_gain
-    output = tmp_path / "mine.yaml"
-    cli.main("identify", [str(drives), "--output", str(output), "--free", "speed_gain"])
-    found = configuration.load(VehicleConfig, output)
-    assert found.speed_gain == pytest.approx(true, rel=0.05)
-    assert replace(found, speed_gain=1.0) == replace(vehicle.load("hmmwv"), speed_gain=1.0)
+def test_what_drives_tell_is_found_and_the_rest_stays_vague(drives, tmp_path, capsys):
+    output, picture = tmp_path / "mine.yaml", tmp_path / "mine.png"
+    free = "speed_gain", "wheel_torque", "tyre_friction"
+    options = ["--free", *free, "--horizon", "8", "--output", f"{output}"]
+    cli.main("identify", [str(drives), *options, "--picture", f"{picture}"])
+    given, found = vehicle.load("hmmwv"), configuration.load(VehicleConfig, output)
+    assert found.speed_gain == pytest.approx(1.6 * given.speed_gain, rel=0.05)
+    assert replace(found, **{name: getattr(given, name) for name in free}) == given
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "| speed_gain    | 1.6" in capsys.readouterr().out
+
+    again = vw.identify(drives, free=free, horizon=8)
+    gain, torque, friction = again.numbers
+    assert gain.low < 1.6 < gain.high
+    assert gain.told > 0.8
+    # The ground of grass has less friction than the tires.
+    assert friction.factor == pytest.approx(1, abs=0.01)
+    assert friction.told < 0.05
+    assert again.after[-1] < 0.2 * again.before[-1]
+    assert torque.ratio is not None
+    wide, narrow = (np.log(high / low) for low, high in ((torque.low, torque.high), torque.ratio))
+    assert wide > 2 * NINETY * MASS
+    assert wide > narrow
+
+
+def test_a_delay_is_found(drives, tmp_path):
+    late = tmp_path / "late"
+    shutil.copytree(drives, late)
+    with np.load(drives / "drives.npz") as recorded:
+        arrays = dict(recorded)
+    # Told a step earlier than they act: what is told last acts no more.
+    arrays["control"][:, :-1] = arrays["control"][:, 1:]
+    np.savez(late / "drives.npz", **arrays)
+    delay, low, high = vw.identify(late, free=("speed_gain",), horizon=8).delay
+    assert low < delay < high
+    assert delay == pytest.approx(0.1, abs=0.01)
 
 
 def test_what_cannot_be_identified_is_named(drives):
