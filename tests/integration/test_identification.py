@@ -91,3 +91,5 @@ def test_a_delay_is_found(drives, tmp_path):
 def test_what_cannot_be_identified_is_named(drives):
     with pytest.raises(ConfigError, match=r"free: speed_gan: .*did you mean 'speed_gain'"):
         vw.identify(drives, free=("speed_gan",))
+    with pytest.raises(ConfigError, match="free: drive: expected a field of numbers, found 'all'"):
+        vw.identify(drives, free=("drive",))

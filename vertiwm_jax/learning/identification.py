@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import geometry
+from vertiwm_jax.config import ConfigError
 from vertiwm_jax.geometry import wrap
 from vertiwm_jax.importers import delay as delays
 from vertiwm_jax.importers.delay import Response
@@ -132,6 +133,11 @@ def identify(
     """
     begin = vehicles.load(vehicle) if isinstance(vehicle, str) else vehicle
     configuration.expect_fields(free, VehicleConfig, where="free: ")
+    for name in free:
+        value = getattr(begin, name)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if not all(isinstance(x, float) for x in numbers):
+            raise ConfigError(f"free: {name}: expected a field of numbers, found {value!r}")
     recorded, terrain = load_drives(drives, "train", FITTED)
     recorded.expect_steered_by(begin)
     context = min(_CONTEXT, max(int(np.max(recorded.length)) - horizon, 0))
@@ -162,15 +168,15 @@ def identify(
     before, after = (predicted(x)[1].mean(axis=0) for x in (np.zeros(len(away)), away))
     _log.info("the simulator errs by %.3f m after %d steps", before[-1], horizon)
     _log.info("  %.3f m with the numbers that were found", after[-1])
-    numbers = []
+    told = list[Number]()
     for name, factor, prior, left in zip(free, factors, deviation, deviations[:-1], strict=True):
         own, of_mass = np.hypot(prior * left, _SURE), name in OF_MASS
         wide = _interval(factor, np.hypot(own, MASS) if of_mass else own)
         ratio = _interval(factor, own) if of_mass else None
-        numbers.append(Number(name, float(factor), *wide, float(np.exp(NINETY * prior)), ratio))
+        told.append(Number(name, float(factor), *wide, float(np.exp(NINETY * prior)), ratio))
     ends = away[-1] + NINETY * deviations[-1] * np.array([0, -1, 1])
     found, low, high = (_delay(late, x) for x in ends.tolist())
-    return Identified(changed(factors), tuple(numbers), (found, low, high), before, after)
+    return Identified(changed(factors), tuple(told), (found, low, high), before, after)
 
 
 def _estimated_delay(drives: Drives) -> float:
@@ -178,7 +184,9 @@ def _estimated_delay(drives: Drives) -> float:
     responses = []
     for state, control, length in zip(drives.state, drives.control, drives.length, strict=True):
         time = np.arange(int(length) + 1) * STEP_SECONDS
-        state, control = np.asarray(state)[: len(time)], np.asarray(control)[: len(time) - 1]
+        state, control = np.asarray(state)[: len(time)], np.array(control)[: len(time) - 1]
+        if drives.turn == "yaw_rate":  # The estimate knows angles alone; speeds are enough.
+            control[:, 1] = 0
         responses.append(Response(time, state[:, 6], state[:, 11], time[:-1], control))
     found = delays.estimate(responses)
     return 0.0 if found is None else found.seconds
