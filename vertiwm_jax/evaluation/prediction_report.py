@@ -110,9 +110,10 @@ class PredictionTest:
         else:
             kinematic = jax.vmap(differential_of)(driven, driven.skid)
             own["differential drive"] = DifferentialDrive(), kinematic
-            for name in [name for name in models if not _is_skid_steered(models[name][1])]:
-                _log.info("%s is left out: front wheels steer what it drives", name)
-                del models[name]
+            for name in models.keys() - own.keys():
+                if not _is_skid_steered(models[name][1]):
+                    _log.info("%s is left out: front wheels steer what it drives", name)
+                    del models[name]
         models |= own
         models["constant velocity"] = ConstantVelocity(), None
         every, tests = TestWindows.nested(drives, terrain, self.context, self.horizons, self.stride)
