@@ -83,11 +83,11 @@ def test_drives_are_read_as_recorded(collected, maps):
 def test_going_on_is_as_if_never_stopped(collected, maps, tmp_path, monkeypatch, capsys):
     write, left = schema.write, []
 
-    def stopping(path, arrays, meta, wheels):
+    def stopping(path, arrays, meta, *others):
         if meta["world"] == 1:
             left.extend(path.name for path in (tmp_path / "drives").iterdir())
             raise KeyboardInterrupt
-        write(path, arrays, meta, wheels)
+        write(path, arrays, meta, *others)
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as stop:
         patch.setattr(schema, "write", stopping)
