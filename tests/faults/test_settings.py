@@ -212,5 +212,6 @@ class Numbers:
 )
 def test_no_setting_is_nan(given):
     (name,) = given
-    with pytest.raises(ConfigError, match=f"{name}: expected a number, found .*nan"):
+    expected = "finite numbers" if name == "several" else "a number"
+    with pytest.raises(ConfigError, match=f"{name}: expected {expected}, found .*nan"):
         Numbers(**given)
