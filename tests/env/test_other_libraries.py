@@ -7,6 +7,7 @@ from env.worlds import bicycle_env, ground, hills
 
 from vertiwm_jax.env.gymnasium import NavigationGymEnv
 from vertiwm_jax.env.navigation import NavigationEnv
+from vertiwm_jax.env.reward import RewardConfig
 from vertiwm_jax.env.suites import circle_tasks
 from vertiwm_jax.env.task import NavigationConfig
 
@@ -15,9 +16,10 @@ METER = 50  # What it is rewarded by to be a meter nearer to the goal.
 
 @pytest.fixture(scope="module")
 def made():
-    """Episodes of 4 s on hills."""
+    """Episodes of 4 s on hills, whose ends cost nothing."""
     terrain = ground(hills())
-    config = NavigationConfig(horizon_seconds=4.0)
+    reward = RewardConfig(timed_out=0.0, timed_out_distance=0.0)
+    config = NavigationConfig(horizon_seconds=4.0, reward=reward)
     return bicycle_env(terrain, circle_tasks(terrain, radius=30.0), config)
 
 
@@ -34,16 +36,18 @@ def test_ppo_of_stable_baselines_learns(made, normalized):
     check_env(NavigationGymEnv(*made))
     env = DummyVecEnv([lambda: Monitor(NavigationGymEnv(*made))] * 2)
     if normalized:
-        env = VecNormalize(env, gamma=0.95)
-    agent = stable_baselines3.PPO("MlpPolicy", env, n_steps=256, seed=0, gamma=0.95, device="cpu")
+        env = VecNormalize(env, gamma=0.8)
+    agent = stable_baselines3.PPO(
+        "MlpPolicy", env, learning_rate=1e-3, n_steps=128, gamma=0.8, seed=0, device="cpu"
+    )
 
     def mean_return() -> float:
         """`Monitor` counts rewards that are not normalized."""
         return float(np.mean(evaluate_policy(agent, env, n_eval_episodes=20)[0]))
 
     before = mean_return()
-    agent.learn(4096 if not normalized else 8192)
-    assert mean_return() > before + 2 * METER
+    agent.learn(4096)
+    assert mean_return() > before + 5 * METER
 
 
 class OneEnd(NavigationEnv):
