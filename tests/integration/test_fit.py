@@ -130,6 +130,7 @@ def test_another_gate_for_the_specialists_of_an_earlier_run(run, fitted, capsys)
     assert (other / "learning_curves.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_specialists_may_share_the_encoders_of_one(run, fitted):
     shared = fitted("--model.encoders", "shared", "--reuse", str(run))
     assert not (shared / "nesam_autoencoders").exists()
@@ -162,6 +163,7 @@ def test_gates_are_added_to_specialists_that_stay_as_they_are(run, fitted, folde
     assert "gates=1" in message and "gates=2" in message
 
 
+@pytest.mark.slow
 def test_a_fit_goes_on_from_a_model_with_more_drives(run, fitted, folder, tmp_path):
     (tmp_path / "more").mkdir()
     shutil.copy(folder / "drives" / "rigid" / "world.npz", tmp_path / "more" / "driven.npz")
@@ -179,6 +181,9 @@ def test_a_fit_goes_on_from_a_model_with_more_drives(run, fitted, folder, tmp_pa
         chex.assert_trees_all_equal(old.replace(network=None), new.replace(network=None))
     inputs = [(place / "nesam_rollouts" / "inputs.txt").read_text() for place in (run, further)]
     assert ["driven.npz" in text for text in inputs] == [False, True]
+
+
+def test_a_fit_does_not_go_on_as_another_model(run, folder, tmp_path):
     other = ("--config", folder / "tiny.yaml", "--model.coefficients", "scalar")
     message = refusal(door("fit"), *other, "--start", run / "model", "--runs", tmp_path / "runs")
     assert "coefficients='scalar'" in message and "coefficients='grouped'" in message
