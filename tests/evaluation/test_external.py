@@ -21,9 +21,9 @@ from vertiwm_jax.simulators.builtin import BuiltIn
 from vertiwm_jax.terrain.map import TerrainMap
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-@pytest.mark.integration
-def test_the_built_in_simulator_outside_jit_is_that_inside(jobs):
+@pytest.fixture(scope="module")
+def inside():
+    """Tasks, what `run_episodes` drives them with, and how it does."""
     semantic = np.full((16, 16), SNOW)
     semantic[:, 8:] = 0
     box = np.array([[15.0, -30.0, 4, 4, 3]])
@@ -38,7 +38,13 @@ def test_the_built_in_simulator_outside_jit_is_that_inside(jobs):
     env = NavigationEnv(Simulator(), config)
     params = env.make_params(chrono_like(load_vehicle()), terrain, tasks, encoders=load_encoders())
     arguments = env, params, jax.tree_util.Partial(led_by_embedding), jax.random.key(0)
-    inside = run_episodes(*arguments)
+    return tasks, arguments, run_episodes(*arguments)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.integration
+def test_the_built_in_simulator_outside_jit_is_that_inside(inside, jobs):
+    tasks, arguments, episodes = inside
     with processes.simulating(jobs) as mapped:
         found = external.evaluate(BuiltIn, mapped, tasks, *arguments)
     assert found.ending.tolist() == [
@@ -47,9 +53,9 @@ def test_the_built_in_simulator_outside_jit_is_that_inside(jobs):
         Reason.TIMED_OUT,
     ]
     for name in ("ending", "steps", "world"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(inside, name))
+        np.testing.assert_array_equal(getattr(found, name), getattr(episodes, name))
     for name in ("position", "rpy", "abs_roll", "abs_pitch", "driven", "final_distance"):
-        ours, theirs = getattr(found, name), getattr(inside, name)
+        ours, theirs = getattr(found, name), getattr(episodes, name)
         np.testing.assert_allclose(ours, theirs, atol=1e-2, err_msg=name)
 
 
