@@ -15,7 +15,9 @@ from vertiwm_jax.learning.fitting import FitConfig
 from vertiwm_jax.learning.losses import LossConfig, step_loss, trajectory_loss
 from vertiwm_jax.learning.objectives import RolloutLoss, TeacherForcingLoss
 from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
+from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.kinematic import ConstantVelocity, KinematicBicycle, bicycle_of
+from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.runs import Run
 from vertiwm_jax.state import Command, VehicleState
@@ -135,6 +137,24 @@ def test_batches_are_of_mirrored_windows_as_often_as_not(data, recorded):
     plain = WindowData.of(as_is, recorded, recorded)
     assert plain.terrain.worlds == 3
     assert float(problem.loss(None, plain, jax.random.key(0))) == 0
+
+
+def test_each_window_is_of_the_vehicle_that_drove_there(recorded):
+    drives, terrain = recorded
+    hmmwv = vehicle.load("hmmwv")
+    heavy = tuple(replace(hmmwv, mass=1000.0 * (1 + world)) for world in range(terrain.worlds))
+    drives = replace(drives, described=(*heavy[:-1], None))
+
+    class Mass:
+        """Whether the vehicle is that of the world, in place of a loss."""
+
+        def __call__(self, params, terrain, window):
+            masses = jnp.array([*(each.mass for each in heavy[:-1]), hmmwv.mass])
+            return (params.vehicle.mass == masses[window.world % 3]).astype(jnp.float32)
+
+    data = WindowData.of(CONFIG, (drives, terrain), (drives, terrain), otherwise=hmmwv)
+    problem = WindowProblem(BICYCLE, Mass(), replace(CONFIG, batch=500))
+    assert float(problem.loss(chrono_like(load_vehicle()), data, jax.random.key(0))) == 1
 
 
 def test_validation_is_the_error_of_the_tables(data):

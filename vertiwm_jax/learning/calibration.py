@@ -9,7 +9,9 @@ import numpy as np
 
 from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.learning.objectives import teacher_forced
+from vertiwm_jax.learning.problem import driven_in
 from vertiwm_jax.learning.windows import Windows
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.world_model import motion
@@ -41,17 +43,26 @@ def normalization(drives: Drives) -> Normalization:
 
 
 def nesam_constants(
-    nesam: Nesam, params: VertiWMParams, terrain: TerrainMap, windows: Windows
+    nesam: Nesam,
+    params: VertiWMParams,
+    terrain: TerrainMap,
+    windows: Windows,
+    vehicles: Vehicle | None = None,
 ) -> VertiWMParams:
-    """The parameters with NeSAM's `correction_scale` and `response`, measured on windows."""
-    assert params.nesam is not None
-    physics = params.nesam.physics(params.vehicle)
+    """The parameters with NeSAM's `correction_scale` and `response`, measured on windows.
+
+    vehicles: of `WindowData`.
+    """
+    constants = params.nesam
+    assert constants is not None
 
     def one(window: Windows) -> tuple[jax.Array, jax.Array]:
         ground = terrain.select(window.world)
+        own = driven_in(params, vehicles, window.world)
+        physics = constants.physics(own.vehicle)
         before, _, after, (proposed, memories) = teacher_forced(
             Alone(nesam),
-            params,
+            own,
             ground,
             window,
             lambda history: (history.specialist.physics, history.specialist.simulator),
@@ -76,20 +87,27 @@ def nesam_constants(
     missed = jnp.abs(missed.reshape(-1, 12))
     missed = jnp.minimum(missed, jnp.percentile(missed, 99.0, axis=0))
     scale, response = jnp.sqrt(jnp.mean(missed**2, axis=0)), jnp.median(response, axis=0)
-    return replace(params, nesam=replace(params.nesam, correction_scale=scale, response=response))
+    return replace(params, nesam=replace(constants, correction_scale=scale, response=response))
 
 
 def gate_constants(
-    model: VertiWM, params: VertiWMParams, terrain: TerrainMap, windows: Windows
+    model: VertiWM,
+    params: VertiWMParams,
+    terrain: TerrainMap,
+    windows: Windows,
+    vehicles: Vehicle | None = None,
 ) -> VertiWMParams:
-    """The parameters with the constants of the gates' context, measured on windows."""
+    """The parameters with the constants of the gates' context, measured on windows.
+
+    vehicles: of `WindowData`.
+    """
     assert params.gate is not None
 
     @jax.jit
     @partial(jax.vmap, in_axes=(None, None, 0))
     def measured(params: VertiWMParams, terrain: TerrainMap, window: Windows) -> jax.Array:
-        ground = terrain.select(window.world)
-        return teacher_forced(model, params, ground, window, lambda history: history.context)[3]
+        ground, own = terrain.select(window.world), driven_in(params, vehicles, window.world)
+        return teacher_forced(model, own, ground, window, lambda history: history.context)[3]
 
     context = measured(params, terrain, windows)
     context = context.reshape(-1, context.shape[-1])

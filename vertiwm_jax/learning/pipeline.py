@@ -27,7 +27,7 @@ from vertiwm_jax.learning.stages import Inputs
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import load_vehicle
+from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig, load_vehicle
 from vertiwm_jax.models.config import ModelConfig, with_soil
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.runs import Run
@@ -94,7 +94,8 @@ class PipelineConfig:
     """What is fitted."""
     vehicle: str | None = None
     """The vehicle whose physics NeSAM corrects: the name of a shipped one, or a YAML file.
-    By default that of the model to go on from, or else the HMMWV."""
+    By default that of the model to go on from, or else the HMMWV. A model of many vehicles
+    (`model.reads_vehicle`) takes those that files of drives describe, and this one elsewhere."""
     windows: WindowConfig = WindowConfig(weights=(1.0, 1.0, 2.0))
     """Which windows of the drives are learned from."""
     loss: LossConfig = LossConfig(velocity=0.05)
@@ -243,7 +244,7 @@ class _Pipeline:
         pair = self._on_its_soil(params).encoders[_PAIR[name]]
         pair = replace(pair, soil=None) if name == "transformer" else pair
         fitted = replace(VertiWMParams((pair,), params.vehicle), **{name: own})
-        data = self._data(WindowData.of, self.config.windows, kinds)
+        data = self._data(self._windows, self.config.windows, kinds)
         for part, objective, schedule in parts if self.from_nothing else parts[1:]:
             if not sees:
                 trainable = [each for each in schedule.trainable if not each.startswith("encoders")]
@@ -283,7 +284,7 @@ class _Pipeline:
             params = calibration.gate_constants(verti_wm, params, *sample)
         objective = RolloutLoss(verti_wm, self.config.loss, attrgetter("coefficients"))
         problem = WindowProblem(verti_wm, objective, self.config.windows)
-        data = self._data(WindowData.of, self.config.windows, config.learns_from)
+        data = self._data(self._windows, self.config.windows, config.learns_from)
         schedule = problem, config.rollouts, config.learns_from
         fitted: list[VertiWMParams] = []
         assert params.gate is not None
@@ -329,6 +330,16 @@ class _Pipeline:
         """What is made once of drives to learn from and to validate on, if it is asked for."""
         return cache(lambda: of(config, self.load(kinds, "train"), self.load(kinds, "validation")))
 
+    def _windows(self, config: WindowConfig, *drives: tuple[Drives, TerrainMap]) -> WindowData:
+        """Windows to learn from and to validate on, with the vehicles that drove there."""
+        return WindowData.of(config, *drives, otherwise=self._otherwise)
+
+    @property
+    def _otherwise(self) -> VehicleConfig | None:
+        """The vehicle where files describe none, of a model of many vehicles."""
+        of_many = self.config.model.reads_vehicle
+        return vehicle.load(self.config.vehicle or HMMWV) if of_many else None
+
     def load(self, kinds: Sequence[Kind], split: Split) -> tuple[Drives, TerrainMap]:
         """Drives of these kinds in all folders, and of folders that are not divided into kinds."""
         key = tuple(kinds), split
@@ -340,13 +351,15 @@ class _Pipeline:
             self.loaded[key] = replace(drives, wheels=WheelSignals()), terrain
         return self.loaded[key]
 
-    def _sample(self, kinds: Sequence[Kind]) -> tuple[TerrainMap, Windows]:
-        """Some windows of the training drives, as a measurement takes them, and their ground."""
+    def _sample(self, kinds: Sequence[Kind]) -> tuple[TerrainMap, Windows, Vehicle | None]:
+        """Some windows of the training drives, as a measurement takes them, their ground, and the
+        vehicles of a model of many."""
         recorded, terrain = self.load(kinds, "train")
         config = self.config.windows
         index = windows.index(recorded, terrain, config.context, config.horizon, config.stride)
         rows = np.linspace(0, len(index.drive) - 1, SAMPLE).astype(int)
-        return terrain, windows.gather(recorded, index, rows)
+        vehicles = self._otherwise and recorded.driven(self._otherwise)
+        return terrain, windows.gather(recorded, index, rows), vehicles
 
 
 def _with_pair(params: VertiWMParams, name: Specialist, pair: Encoders) -> VertiWMParams:

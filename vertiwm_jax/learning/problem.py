@@ -1,6 +1,6 @@
 """Windows of recorded drives as what a model is fitted to and validated on."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import jax
@@ -15,6 +15,7 @@ from vertiwm_jax.learning import augment, windows
 from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.learning.objectives import Objective, open_loop
 from vertiwm_jax.learning.windows import GROUNDS, WindowIndex, Windows
+from vertiwm_jax.mechanics.vehicle import Vehicle, VehicleConfig
 from vertiwm_jax.terrain.map import TerrainMap
 
 
@@ -44,6 +45,7 @@ class WindowData:
 
     drives, index: where the N windows lie; share: `[N]` the chance that a window or one before it
     is drawn; terrain: with the mirror images of its worlds if windows are mirrored.
+    vehicles, validation_vehicles: leaves `[W, ...]`, by world; None where parameters hold the one.
     """
 
     drives: Drives
@@ -52,6 +54,8 @@ class WindowData:
     terrain: TerrainMap
     validation: Windows
     validation_terrain: TerrainMap
+    vehicles: Vehicle | None = None
+    validation_vehicles: Vehicle | None = None
 
     @classmethod
     def of(
@@ -59,8 +63,11 @@ class WindowData:
         config: WindowConfig,
         training: tuple[Drives, TerrainMap],
         validation: tuple[Drives, TerrainMap],
+        otherwise: VehicleConfig | None = None,
     ) -> Self:
         """All windows of the training drives, and some of the validation drives.
+
+        otherwise: if drives are of many vehicles, the one where a file describes none.
 
         Raises `DataError` when drives are too short, `MapError` when maps cannot be mirrored,
         `ConfigError` when no window has a chance to be drawn.
@@ -80,6 +87,8 @@ class WindowData:
             terrain=augment.with_mirrored(terrain) if config.mirror else terrain,
             validation=windows.gather(validation[0], held_out, rows),
             validation_terrain=validation[1],
+            vehicles=otherwise and drives.driven(otherwise),
+            validation_vehicles=otherwise and validation[0].driven(otherwise),
         )
 
 
@@ -104,30 +113,43 @@ class WindowProblem:
         if self.config.mirror:
             batch = augment.mirror_some(mirror_key, batch, data.terrain)
 
-        def one(params: Params, terrain: TerrainMap, window: Windows) -> jax.Array:
-            return self.objective(params, terrain.select(window.world), window)
+        def one(
+            params: Params, terrain: TerrainMap, vehicles: Vehicle | None, window: Windows
+        ) -> jax.Array:
+            own = driven_in(params, vehicles, window.world)
+            return self.objective(own, terrain.select(window.world), window)
 
-        return jnp.mean(parallel.vmap(one, (None, None, 0))(params, data.terrain, batch))
+        every = parallel.vmap(one, (None, None, None, 0))
+        return jnp.mean(every(params, data.terrain, data.vehicles, batch))
 
     def validate(self, params: Params, data: WindowData) -> dict[str, jax.Array]:
         """Position errors, m; a prediction that is not finite counts as not having moved."""
 
         def one(
-            params: Params, terrain: TerrainMap, window: Windows
+            params: Params, terrain: TerrainMap, vehicles: Vehicle | None, window: Windows
         ) -> tuple[jax.Array, jax.Array]:
             terrain = terrain.select(window.world)
-            predicted, _ = open_loop(self.dynamics, params, terrain, window)
+            own = driven_in(params, vehicles, window.world)
+            predicted, _ = open_loop(self.dynamics, own, terrain, window)
             truth, start = window.state[-1, :3], window.state[window.context, :3]
             error = jnp.linalg.norm(predicted.position[-1] - truth)
             lost = ~jnp.isfinite(error)
             return jnp.where(lost, jnp.linalg.norm(start - truth), error), lost
 
-        all_of_them = parallel.vmap(one, (None, None, 0), self.config.batch)
-        error, lost = all_of_them(params, data.validation_terrain, data.validation)
+        every = parallel.vmap(one, (None, None, None, 0), self.config.batch)
+        where = data.validation_terrain, data.validation_vehicles
+        error, lost = every(params, *where, data.validation)
         kinds = data.validation.ground == jnp.arange(len(GROUNDS))[:, None]
         means = jnp.sum(kinds * error, axis=1) / jnp.sum(kinds, axis=1)
         by_kind = {f"error_{kind}": mean for kind, mean in zip(GROUNDS, means, strict=True)}
         return {**by_kind, "error": jnp.nanmean(means), "diverged": jnp.mean(lost)}
+
+
+def driven_in(params: Params, vehicles: Vehicle | None, world: jax.Array) -> Params:
+    """The parameters with the vehicle of a world `[]`, also of the mirror image of one."""
+    if vehicles is None:
+        return params
+    return replace(params, vehicle=vehicles.select(world % len(vehicles.mass)))
 
 
 def _spread(ground: np.ndarray, most: int) -> np.ndarray:

@@ -144,7 +144,7 @@ class Vehicle:
 
     def select(self, which: jax.Array) -> "Vehicle":
         """One of stacked vehicles, by its number `[]`."""
-        return jax.tree.map(lambda leaf: leaf[which], self)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], self)
 
     def curvature(self, steering: jax.Array | np.ndarray) -> jax.Array:
         """`[...]` 1/m of the arcs driven at a steering in [-1, 1], left positive; those of a
