@@ -89,7 +89,8 @@ class Number:
 class Identified:
     """What drives tell of a vehicle.
 
-    vehicle: its numbers. delay: after which commands act, s, with its 90 % interval.
+    vehicle: its numbers. delay: after which commands act, s at full size as in the drives, with its
+        90 % interval.
     before, after: `[K]` mean position error, m, after each step of prediction, by the numbers that
         were given and by those that were found.
     """
