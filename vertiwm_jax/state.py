@@ -3,7 +3,7 @@
 Every array may carry any number of leading batch axes, written `...`.
 """
 
-from typing import Self
+from typing import Literal, Self
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,8 @@ from vertiwm_jax import geometry
 
 STEP_SECONDS = 0.1
 """The sampling interval of the paper: one transition lasts 0.1 s."""
+Turn = Literal["steering", "yaw_rate"]
+"""What the second of two commands is: a front-wheel angle, rad, or a yaw rate, rad/s."""
 
 
 @struct.dataclass

@@ -65,11 +65,14 @@ def _told(found: Identified) -> list[str]:
     ]
     seconds = len(found.before) * STEP_SECONDS
     delay, low, high = found.delay
+    beside = (
+        " Drives tell forces and moments of inertia only beside the mass, which was taken as given "
+        f"to {np.expm1(identification.NINETY * MASS):.0%}."
+    )
     return [
         markdown(rows),
         "",
-        "90 % intervals. Drives tell forces and moments of inertia only beside the mass, which was "
-        f"taken as given, to {np.expm1(identification.NINETY * MASS):.0%}.",
+        "90 % intervals." + (beside if any(number.ratio for number in found.numbers) else ""),
         f"Commands act {delay:.2f} s late ({low:.2f}-{high:.2f}).",
         f"Position error after {seconds:.1f} s: {found.before[-1]:.3f} m with what was given, "
         f"{found.after[-1]:.3f} m with what was found.",

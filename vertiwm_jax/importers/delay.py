@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from vertiwm_jax.learning.schema import Turn
+from vertiwm_jax.state import Turn
 
 _GRID = 0.01
 _DELAYS = np.arange(0, 0.805, _GRID)

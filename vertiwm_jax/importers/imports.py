@@ -21,9 +21,9 @@ from vertiwm_jax.importers.resampling import Drive
 from vertiwm_jax.importers.settings import GridMapSettings, ImportSettings
 from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.dataset import SplitConfig
-from vertiwm_jax.learning.schema import DataError, Turn
+from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.runs import Progress
-from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.state import STEP_SECONDS, Turn
 from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain.map import TerrainMap
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from vertiwm_jax.config import Bounds, NotNegative, Positive, settings
+from vertiwm_jax.state import Turn
 from vertiwm_jax.terrain.classes import STANDARD
 
 Triple = tuple[float, float, float]
@@ -34,7 +35,7 @@ class VehicleSettings:
     and map are enlarged by it, times and speeds by its square root, before `resampling`."""
 
     @property
-    def turn(self) -> Literal["steering", "yaw_rate"]:
+    def turn(self) -> Turn:
         """What the second of the commands of its drives is."""
         return "yaw_rate" if self.steered == "skid" else "steering"
 

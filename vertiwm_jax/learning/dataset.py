@@ -6,7 +6,7 @@ The format of the files is that of `vertiwm_jax.learning.schema`.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +16,12 @@ from flax import struct
 from vertiwm_jax import geometry
 from vertiwm_jax.config import Share, settings
 from vertiwm_jax.learning import schema
-from vertiwm_jax.learning.schema import SPLITS, DataError, Turn
+from vertiwm_jax.learning.schema import SPLITS, DataError
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.measured import is_described, measured
 from vertiwm_jax.mechanics.vehicle import Vehicle, VehicleConfig
 from vertiwm_jax.precision import float32
+from vertiwm_jax.state import Turn
 from vertiwm_jax.terrain import files, query
 from vertiwm_jax.terrain.map import TerrainMap, stack
 
@@ -265,6 +266,7 @@ def load_drives(
     paths: list[Path] = []
     parts: list[dict[str, np.ndarray]] = []
     maps: list[TerrainMap] = []
+    facts: list[dict[str, Any]] = []
     given = [folders] if isinstance(folders, str | Path) else folders
     collections = [Collection.of(folder, splits) for folder in given]
     expect_drives(collections, split)
@@ -273,35 +275,38 @@ def load_drives(
             rows = collection.rows(path, split)
             if not len(rows):
                 continue
-            arrays, terrain = _read(path)
+            arrays, terrain, said = _read(path)
             picked = {name: array[rows] for name, array in arrays.items()}
             parts.append({**picked, "world": np.full(len(rows), len(maps), np.int32)})
             maps.append(terrain)
             paths.append(path)
-    return _join(paths, parts), stack(maps, [f"map of {path}" for path in paths])
+            facts.append(said)
+    return _join(paths, facts, parts), stack(maps, [f"map of {path}" for path in paths])
 
 
 def load_file(path: Path) -> tuple[Drives, TerrainMap]:
     """All drives of one file, with its map; raises like `load_drives`."""
-    arrays, terrain = _read(path)
+    arrays, terrain, said = _read(path)
     world = np.zeros(len(arrays["length"]), np.int32)
-    return _join([path], [{**arrays, "world": world}]), terrain
+    return _join([path], [said], [{**arrays, "world": world}]), terrain
 
 
-def _read(path: Path) -> tuple[dict[str, np.ndarray], TerrainMap]:
-    """The arrays of all drives of a file, without what they are for, and its map."""
+def _read(path: Path) -> tuple[dict[str, np.ndarray], TerrainMap, dict[str, Any]]:
+    """The arrays of all drives of a file, without what they are for, its map, and what it says of
+    its vehicle."""
     arrays, meta = schema.read(path)
     arrays.pop("split", None)
     terrain = files.load_map(schema.find_map(path, meta["map"]))
-    turn = schema.turn_of(path, schema.vehicle_facts(path))
-    arrays = schema.check(path, arrays, terrain.offset(), turn)
+    said = schema.vehicle_facts(meta)
+    arrays = schema.check(path, arrays, terrain.offset(), schema.turn_of(path, said))
     _check_place(path, arrays, terrain)
     if "wheel_class" not in arrays:
         wheels = np.asarray(meta["vehicle"]["wheels_in_body_xy"], np.float32)
         arrays["wheel_class"] = _look_up_classes(terrain, arrays["state"], wheels)
     schema.check_classes(path, arrays["wheel_class"], len(terrain.class_names))
     kinds = {"length": np.int32, "wheel_class": np.uint8}
-    return arrays | {name: arrays[name].astype(kind) for name, kind in kinds.items()}, terrain
+    arrays |= {name: arrays[name].astype(kind) for name, kind in kinds.items()}
+    return arrays, terrain, said
 
 
 def _check_place(path: Path, arrays: dict[str, np.ndarray], terrain: TerrainMap) -> None:
@@ -327,8 +332,10 @@ def _look_up_classes(terrain: TerrainMap, state: np.ndarray, wheels: np.ndarray)
     return np.asarray(query.surface(terrain, jnp.asarray(xy)).semantic)
 
 
-def _join(paths: list[Path], parts: list[dict[str, np.ndarray]]) -> Drives:
-    """All parts one after the other, padded to the longest drive."""
+def _join(
+    paths: list[Path], facts: list[dict[str, Any]], parts: list[dict[str, np.ndarray]]
+) -> Drives:
+    """All parts one after the other, padded to the longest drive; facts: of their vehicles."""
     every = set().union(*parts)
     for name in sorted(every):
         lacking = [path for path, part in zip(paths, parts, strict=True) if name not in part]
@@ -341,7 +348,6 @@ def _join(paths: list[Path], parts: list[dict[str, np.ndarray]]) -> Drives:
     signals = WheelSignals(
         **{name: joined.pop(name) for name in schema.WHEEL_SIGNALS if name in joined}
     )
-    facts = [schema.vehicle_facts(path) for path in paths]
     described = (
         measured(own, f"{path}: meta.vehicle") if is_described(own) else None
         for path, own in zip(paths, facts, strict=True)

@@ -185,10 +185,9 @@ def _estimated_delay(drives: Drives) -> float:
     responses = []
     for state, control, length in zip(drives.state, drives.control, drives.length, strict=True):
         time = np.arange(int(length) + 1) * STEP_SECONDS
-        state, control = np.asarray(state)[: len(time)], np.array(control)[: len(time) - 1]
-        if drives.turn == "yaw_rate":  # The estimate knows angles alone; speeds are enough.
-            control[:, 1] = 0
-        responses.append(Response(time, state[:, 6], state[:, 11], time[:-1], control))
+        state, control = np.asarray(state)[: len(time)], np.asarray(control)[: len(time) - 1]
+        told = time[:-1], control, drives.turn
+        responses.append(Response(time, state[:, 6], state[:, 11], *told))
     found = delays.estimate(responses)
     return 0.0 if found is None else found.seconds
 

@@ -36,7 +36,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,7 +44,7 @@ from numpy.typing import ArrayLike
 from vertiwm_jax import atomic
 from vertiwm_jax.arrays import load_archive
 from vertiwm_jax.errors import UserError, refusing
-from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.state import STEP_SECONDS, Turn
 
 SPLITS = "train", "validation", "test"
 """What drives are for."""
@@ -56,8 +56,6 @@ WHEEL_SIGNALS = {
     "steer_angle": (2,),
 }
 """What may be recorded beside the states, and its shape at one moment."""
-Turn = Literal["steering", "yaw_rate"]
-"""What the second of two commands is: a front-wheel angle, rad, or a yaw rate, rad/s."""
 UNNAMED = "unnamed"
 """A vehicle whose name no file says."""
 _REQUIRED = {"state": (12,), "control": (2,), "length": ()}
@@ -141,9 +139,9 @@ def _stored(path: Path, names: Sequence[str], required: Sequence[str]) -> dict[s
     return found
 
 
-def vehicle_facts(path: Path) -> dict[str, Any]:
-    """What a file, which can be read, says of its vehicle; see `mechanics.measured`."""
-    vehicle = json.loads(str(load_archive(path, ("meta",))["meta"])).get("vehicle")
+def vehicle_facts(meta: Mapping[str, Any]) -> dict[str, Any]:
+    """What the meta of a file says of its vehicle; see `mechanics.measured`."""
+    vehicle = meta.get("vehicle")
     return vehicle if isinstance(vehicle, dict) else {}
 
 

@@ -403,18 +403,15 @@ def bulldozing(
     sin_slip_angle = -m.lateral * jax.lax.rsqrt(m.hub**2 + m.lateral**2 + contact.creep_speed**2)
     tangent = jnp.tan(soil.friction_angle)
     cotangent = jnp.tan(jnp.pi / 4 + soil.friction_angle / 2)  # of Xc; equals tan(Xc + phi)
-    if contact.ploughing is not None:
-        driven = sliding(contact.ploughing, contact.creep_speed, m).driven
-        share = contact.ploughing.side * (1 - contact.ploughing.side_slip * driven)
-        height = radius * jnp.maximum(at.cos - jnp.cos(p.entry), 0.0)
-        d2 = cotangent + cotangent**2 * tangent
-        pressure = 2 * cotangent * height * (soil.cohesion + d2 * soil.unit_weight * height / 2)
-        return share * pressure * jnp.maximum(at.cos, 0.0) * sin_slip_angle
-    if contact.bulldozing == "ishigami":
+    if contact.ploughing is not None or contact.bulldozing == "ishigami":
         below = radius * jnp.maximum(at.cos - jnp.cos(p.entry), 0.0)
         d2 = cotangent + cotangent**2 * tangent
         pressure = 2 * cotangent * below * (soil.cohesion + d2 * soil.unit_weight * below / 2)
-        return pressure * (1 - below * at.cos / radius) * sin_slip_angle
+        if contact.ploughing is None:
+            return pressure * (1 - below * at.cos / radius) * sin_slip_angle
+        driven = sliding(contact.ploughing, contact.creep_speed, m).driven
+        share = contact.ploughing.side * (1 - contact.ploughing.side_slip * driven)
+        return share * pressure * jnp.maximum(at.cos, 0.0) * sin_slip_angle
     # Wong: the pressed soil fills the segment under the chord from exit to entry.
     share = (at.sin - jnp.sin(p.exit)) / (jnp.sin(p.entry) - jnp.sin(p.exit))
     chord = share * (jnp.cos(p.exit) - jnp.cos(p.entry))

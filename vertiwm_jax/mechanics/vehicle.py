@@ -15,7 +15,7 @@ from vertiwm_jax import froude
 from vertiwm_jax.config import Positive, settings
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.precision import float32
-from vertiwm_jax.state import Command
+from vertiwm_jax.state import Command, Turn
 
 GRAVITY = 9.81
 HMMWV = "hmmwv"
@@ -258,7 +258,7 @@ class VehicleConfig:
             raise ValueError(f"skid: expected {expected}, found {self.drive} and {self.locked}")
 
     @property
-    def turn(self) -> Literal["steering", "yaw_rate"]:
+    def turn(self) -> Turn:
         """What the second of its commands is."""
         return "yaw_rate" if self.skid else "steering"
 
