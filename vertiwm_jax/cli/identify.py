@@ -66,8 +66,8 @@ def _told(found: Identified) -> list[str]:
     seconds = len(found.before) * STEP_SECONDS
     delay, low, high = found.delay
     beside = (
-        " Drives tell forces and moments of inertia only beside the mass, which was taken as given "
-        f"to {np.expm1(identification.NINETY * MASS):.0%}."
+        " Drives tell forces and moments of inertia only beside the mass, which is taken as given, "
+        f"give or take {np.expm1(identification.NINETY * MASS):.0%}."
     )
     return [
         markdown(rows),
