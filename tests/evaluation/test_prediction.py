@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.tree_util import Partial
 from scipy.spatial.transform import Rotation
 
 from vertiwm_jax.dynamics import rollout
@@ -23,9 +24,12 @@ from vertiwm_jax.mechanics.kinematic import (
 )
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import load, load_vehicle, stack
+from vertiwm_jax.models.config import ModelConfig, with_soil
+from vertiwm_jax.models.registry import moving
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.world_model.alone import Alone
 
 DRIVES = Path(__file__).parents[1] / "data" / "chrono_drives"
 CONTEXT, HORIZON = 4, 6
@@ -284,7 +288,16 @@ def test_predictions_are_of_the_selected_worlds():
 
 
 @pytest.mark.integration
-def test_every_world_is_predicted_with_its_own_vehicle():
+def untrained():
+    """NeSAM of many vehicles, which has learned nothing beside physics."""
+    config = ModelConfig(parts=("nesam",), terrain="none", reads_vehicle=True)
+    params = config.init_params(jax.random.key(0), chrono_like(load_vehicle()))
+    model = Alone(config.nesam)
+    return model, Partial(moving, with_soil(model.part_of(params), None))
+
+
+@pytest.mark.parametrize("model", [lambda: (Simulator(), Partial(chrono_like)), untrained])
+def test_every_world_is_predicted_with_its_own_vehicle(model):
     """Two vehicles accelerate and turn on worlds of their own; each is its own best model."""
     configs = load("hmmwv"), replace(load("hmmwv"), mass=5e3, drive="rear", wheel_torque=2e3)
     terrain, steps = terrain_map.stack([GROUND, GROUND]), CONTEXT + HORIZON
@@ -301,8 +314,7 @@ def test_every_world_is_predicted_with_its_own_vehicle():
 
     def errors(*order):
         vehicles = stack([configs[i].vehicle for i in order])
-        params = jax.vmap(chrono_like)(vehicles)
-        found = prediction.predict(Simulator(), params, test, by_world=True).states
+        found = prediction.predict(*model(), test, vehicles).states
         return prediction.absolute_errors(found, test)[0]["position"][:, -1]
 
     assert errors(0, 1).max() < 2e-3

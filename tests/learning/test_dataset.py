@@ -233,6 +233,8 @@ def test_half_a_recording_is_refused(tmp_path):
     ) as caught:
         dataset.load_drives(tmp_path, "train")
     assert str(caught.value).startswith(f"{path}: ")
+    drives, _ = dataset.load_drives(tmp_path, "train", wheels=False)
+    assert drives.wheels == dataset.WheelSignals()
 
 
 def far_away(folder, state):

@@ -132,7 +132,7 @@ def test_torques_are_within_the_pedal_and_differentiable_beyond_it():
 def test_the_kinematic_yardstick_has_the_gain_and_lags_of_the_vehicle():
     vehicle = ROBOT.vehicle
     assert vehicle.skid is not None
-    params = differential_of(vehicle, vehicle.skid)
+    params = differential_of(vehicle)
     commands = Command(jnp.full(STEPS, 0.4), jnp.full(STEPS, 0.5))
     start = place(GROUND, vehicle=vehicle)
     driven = rollout(DifferentialDrive(), params, GROUND, start, commands)

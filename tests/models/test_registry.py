@@ -13,13 +13,14 @@ from world_model.examples import commands, driving, one, rough
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import embedding, rollout
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import load
-from vertiwm_jax.models import files
+from vertiwm_jax.mechanics.vehicle import load, load_vehicle
+from vertiwm_jax.models import files, registry
 from vertiwm_jax.models.config import ModelConfig, with_soil
 from vertiwm_jax.models.registry import load_fitted, load_model
 from vertiwm_jax.networks.specialist import cast_weights
 from vertiwm_jax.world_model.nesam import Nesam
 
+KEY = jax.random.key(0)
 TERRAIN, STATES, COMMANDS = rough(), driving(3, 5), commands(8)
 LEARNED = ("vertiwm", "transformer", "nesam")
 
@@ -44,10 +45,36 @@ def test_a_model_moves_the_vehicle_that_it_was_saved_with(tmp_path):
     """Of any layout, whose leaves those of the HMMWV do not have."""
     driven = replace(load("rover"), drive="rear", locked="rear", wheel_radius=(0.05, 0.06)).vehicle
     config = ModelConfig(parts=("nesam",), terrain="none")
-    params = config.init_params(jax.random.key(0), chrono_like(driven))
+    params = config.init_params(KEY, chrono_like(driven))
     files.save(tmp_path, config, params)
     found = files.load(tmp_path)[1].vehicle
     chex.assert_trees_all_equal(jax.device_get(found), driven)
+
+
+@pytest.mark.parametrize("of_many", [True, False])
+def test_a_model_of_many_vehicles_moves_the_one_that_is_asked_for(tmp_path, of_many):
+    rover = load("rover").vehicle
+    config = ModelConfig(parts=("nesam",), terrain="none", reads_vehicle=of_many)
+    files.save(tmp_path, config, config.init_params(KEY, chrono_like(load_vehicle())))
+    _, own = load_model("nesam", tmp_path)
+    _, asked = load_model("nesam", tmp_path, vehicle=rover)
+    chex.assert_trees_all_equal(own.vehicle, load_vehicle())
+    chex.assert_trees_all_equal(asked.vehicle, rover if of_many else load_vehicle())
+
+
+@pytest.mark.integration
+def test_a_model_of_one_vehicle_begins_to_learn_of_many():
+    """It moves the HMMWV as before, and does not heed what it is told of others."""
+    config, params = files.load(files.PRETRAINED)
+    config = replace(config, reads_vehicle=False)
+    of_many, learner = config.reading_vehicles(params)
+    assert of_many == replace(config, reads_vehicle=True)
+    for vehicle in (load_vehicle(), replace(load_vehicle(), speed_gain=jnp.float32(0.3))):
+        expected, found = (
+            drive(model.verti_wm, registry.moving(given, vehicle), STATES).vector
+            for model, given in ((config, params), (of_many, learner))
+        )
+        np.testing.assert_allclose(found, expected, atol=2e-4)
 
 
 def test_embeddings_are_kept_where_they_are_asked_for():
@@ -125,7 +152,7 @@ def filled(leaf):
 def test_what_was_saved_is_loaded_by_its_parts(tmp_path, encoders, terrain):
     parts = ("transformer", "nesam") if terrain != "patches" else ("transformer", "nesam", "gate")
     config = ModelConfig(parts, terrain=terrain, encoders=encoders)
-    params = config.init_params(jax.random.key(0), load_model("builtin")[1])
+    params = config.init_params(KEY, load_model("builtin")[1])
     files.save(tmp_path, config, params)
     found, loaded = files.load(tmp_path)
     assert found == config

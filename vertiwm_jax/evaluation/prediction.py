@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import itemgetter
 from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jax.typing import ArrayLike
 
 from vertiwm_jax import geometry
@@ -20,6 +20,7 @@ from vertiwm_jax.learning.dataset import Drives, WheelSignals
 from vertiwm_jax.learning.objectives import open_loop
 from vertiwm_jax.learning.windows import GROUNDS, Windows
 from vertiwm_jax.mechanics.simulator import SimulatorHistory
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.precision import float32
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import query
@@ -190,25 +191,33 @@ class Predicted(NamedTuple):
 
 
 def predict(
-    dynamics: Dynamics, params: Params, test: TestWindows, by_world: bool = False
+    dynamics: Dynamics, params: Params | Partial, test: TestWindows, driven: Vehicle | None = None
 ) -> Predicted:
     """Predicts every window open-loop; the results are in host memory.
 
-    by_world: whether each world has parameters of its own, leaves `[W, ...]`.
+    params: of the model, or what makes them of a vehicle.
+    driven: that vehicle by world, leaves `[W, ...]`.
 
     The history is warmed up on the recorded context. From its last state on, the model sees its own
     predictions and the recorded commands (the paper's protocol, Sec. V-A).
     """
-    return jax.device_get(_predict(dynamics, params, test.terrain, test.windows, by_world))
+    return jax.device_get(_predict(dynamics, params, test.terrain, test.windows, driven))
 
 
-@partial(jax.jit, static_argnames=("dynamics", "by_world"))
+@partial(jax.jit, static_argnames="dynamics")
 def _predict(
-    dynamics: Dynamics, params: Params, terrain: TerrainMap, windows: Windows, by_world: bool
+    dynamics: Dynamics,
+    params: Params | Partial,
+    terrain: TerrainMap,
+    windows: Windows,
+    driven: Vehicle | None,
 ) -> Predicted:
     def one(window: Windows) -> Predicted:
         ground = terrain.select(window.world)
-        own = jax.tree.map(itemgetter(window.world), params) if by_world else params
+        own = params
+        if isinstance(params, Partial):
+            assert driven is not None, "parameters of a vehicle need one"
+            own = params(driven.select(window.world))
         return Predicted(*open_loop(dynamics, own, ground, window, Reading.of))
 
     return jax.lax.map(one, windows, batch_size=BATCH)

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import jax
 import numpy as np
+from jax.tree_util import Partial
 
 from vertiwm_jax import atomic
 from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, settings
@@ -29,7 +29,13 @@ from vertiwm_jax.mechanics.kinematic import (
 )
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.models.config import SoilSource
-from vertiwm_jax.models.registry import ModelName, load_fitted, load_model
+from vertiwm_jax.models.registry import (
+    ModelName,
+    load_fitted,
+    load_model,
+    moving,
+    reads_vehicle,
+)
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.world_model.fusion import COEFFICIENTS
 
@@ -91,36 +97,37 @@ class PredictionTest:
             _log.info("%s; predicted: %s", collection, split)
         dataset.expect_drives(collections, split, self.context + max(self.horizons))
         given = vehicle.load(self.vehicle or vehicle.HMMWV)
-        models: dict[str, tuple[Dynamics, Params]] = {
+        learned: dict[str, tuple[Dynamics, Params]] = {
             name: load_model(name, self.weights, soil=self.soil)
-            for name in dict.fromkeys((*self.models, "builtin"))
+            for name in self.models
+            if name != "builtin"
         }
         for folder in self.compare:
             fitted = load_fitted(folder / "model")
-            models |= {f"{folder.name}: {part}": model for part, model in fitted.items()}
+            learned |= {f"{folder.name}: {part}": model for part, model in fitted.items()}
         drives, terrain = dataset.load_drives(self.data, split, self.splits)
         if self.vehicle:
             drives = replace(drives, described=(None,) * terrain.worlds)
         driven = drives.driven(given)
-        own: dict[str, tuple[Dynamics, Params]] = {
-            "builtin": (Simulator(), jax.vmap(chrono_like)(driven)),
-        }
+        models: dict[str, tuple[Dynamics, Params | Partial]] = {}
+        for name, (dynamics, params) in learned.items():
+            if reads_vehicle(dynamics):
+                models[name] = dynamics, Partial(moving, params)
+            elif (params.vehicle.skid is None) == (driven.skid is None):
+                models[name] = dynamics, params
+            else:
+                _log.info("%s is left out: it drives a vehicle that is steered otherwise", name)
+        models["builtin"] = Simulator(), Partial(chrono_like)
         if driven.skid is None:
-            own["kinematic bicycle"] = KinematicBicycle(), jax.vmap(bicycle_of)(driven)
+            models["kinematic bicycle"] = KinematicBicycle(), Partial(bicycle_of)
         else:
-            kinematic = jax.vmap(differential_of)(driven, driven.skid)
-            own["differential drive"] = DifferentialDrive(), kinematic
-            for name in models.keys() - own.keys():
-                if not _is_skid_steered(models[name][1]):
-                    _log.info("%s is left out: front wheels steer what it drives", name)
-                    del models[name]
-        models |= own
+            models["differential drive"] = DifferentialDrive(), Partial(differential_of)
         models["constant velocity"] = ConstantVelocity(), None
         every, tests = TestWindows.nested(drives, terrain, self.context, self.horizons, self.stride)
         predicted = {}
         with Progress(len(models), "models") as progress:
             for name, model in models.items():
-                predicted[name] = prediction.predict(*model, every, by_world=name in own)
+                predicted[name] = prediction.predict(*model, every, driven)
                 progress.advance(1, f"{name}, {len(every.drive):,} windows")
         found, tables = [], []
         for steps, (rows, test) in tests.items():
@@ -145,10 +152,6 @@ class PredictionTest:
         if self.json:
             atomic.write(self.json, yardsticks.json_text(found))
         return "\n\n".join(tables)
-
-
-def _is_skid_steered(params: Params) -> bool:
-    return getattr(getattr(params, "vehicle", None), "skid", None) is not None
 
 
 def _files(

@@ -244,6 +244,8 @@ def load_drives(
     folders: str | Path | Sequence[str | Path],
     split: Split = "train",
     splits: SplitConfig = SplitConfig(),
+    *,
+    wheels: bool = True,
 ) -> tuple[Drives, TerrainMap]:
     """Loads recorded drives, and the maps that they were driven on.
 
@@ -253,6 +255,7 @@ def load_drives(
             the worlds that are left out, `unseen`; or `all`.
         splits: how the drives of a folder are shared out whose files do not say it, and which
             worlds are left out.
+        wheels: whether to load signals of wheels and chassis too, which all files have or none.
 
     Returns:
         D drives at 10 Hz, of T steps at most: states `[D, T + 1, 12]` (position in m and roll,
@@ -276,7 +279,8 @@ def load_drives(
             if not len(rows):
                 continue
             arrays, terrain, said = _read(path)
-            picked = {name: array[rows] for name, array in arrays.items()}
+            wanted = arrays.keys() if wheels else arrays.keys() - set(schema.WHEEL_SIGNALS)
+            picked = {name: arrays[name][rows] for name in wanted}
             parts.append({**picked, "world": np.full(len(rows), len(maps), np.int32)})
             maps.append(terrain)
             paths.append(path)

@@ -17,7 +17,7 @@ import numpy as np
 from vertiwm_jax.config import CountOrZero, settings
 from vertiwm_jax.dynamics import Params
 from vertiwm_jax.learning import autoencoders, calibration, dataset, stages, windows
-from vertiwm_jax.learning.dataset import Collection, Drives, Split, SplitConfig, WheelSignals
+from vertiwm_jax.learning.dataset import Collection, Drives, Split, SplitConfig
 from vertiwm_jax.learning.fitting import FitConfig, Problem
 from vertiwm_jax.learning.losses import LossConfig
 from vertiwm_jax.learning.objectives import RolloutLoss, TeacherForcingLoss
@@ -345,10 +345,10 @@ class _Pipeline:
         key = tuple(kinds), split
         if key not in self.loaded:
             drives, terrain = dataset.load_drives(
-                folders(self.config, kinds), split, self.config.splits
+                folders(self.config, kinds), split, self.config.splits, wheels=False
             )
             drives.expect_steered_by(vehicle.load(self.config.vehicle or vehicle.HMMWV))
-            self.loaded[key] = replace(drives, wheels=WheelSignals()), terrain
+            self.loaded[key] = drives, terrain
         return self.loaded[key]
 
     def _sample(self, kinds: Sequence[Kind]) -> tuple[TerrainMap, Windows, Vehicle | None]:

@@ -8,7 +8,7 @@ from flax import struct
 from numpy.typing import ArrayLike
 
 from vertiwm_jax import geometry
-from vertiwm_jax.mechanics.vehicle import Skid, Vehicle, load_vehicle
+from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
 from vertiwm_jax.precision import float32
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain import query
@@ -115,8 +115,10 @@ class DifferentialParams:
 
 
 @float32
-def differential_of(vehicle: Vehicle, skid: Skid) -> DifferentialParams:
+def differential_of(vehicle: Vehicle) -> DifferentialParams:
     """The skid-steered `vehicle` if nothing slipped."""
+    skid = vehicle.skid
+    assert skid is not None, "front wheels steer it"
     numbers = vehicle.wheelbase, vehicle.track, vehicle.ride_height, skid.gain, skid.gain
     return DifferentialParams(*map(jnp.float32, (*numbers, skid.speed_lag, skid.turn_lag, 0, 0)))
 

@@ -1,14 +1,15 @@
 """Which world model: what it is made of, in a form that a file can hold."""
 
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
 import jax
 
 from vertiwm_jax.config import AtLeastOne, Count, settings
 from vertiwm_jax.mechanics.simulator import SimulatorParams
-from vertiwm_jax.networks.specialist import BASE, PAPER, NetworkSize
+from vertiwm_jax.networks.specialist import BASE, PAPER, NetworkSize, with_more_inputs
 from vertiwm_jax.perception.features import Encoders, init_pair, init_reduce, init_soil
+from vertiwm_jax.world_model import vehicle_features
 from vertiwm_jax.world_model.fusion import Coefficients, GateParams, GateTerrain
 from vertiwm_jax.world_model.nesam import Nesam
 from vertiwm_jax.world_model.normalization import Normalization
@@ -105,6 +106,17 @@ class ModelConfig:
             return params
         new = GateParams.untrained(key, self.gate_terrain, more)
         return replace(params, gate=params.gate.beside(new))
+
+    def reading_vehicles(self, params: VertiWMParams) -> tuple[Self, VertiWMParams]:
+        """The same for many vehicles, and parameters whose specialists ignore what they are told
+        of the vehicle, until they learn from it."""
+
+        def told(part: Any) -> Any:
+            more = vehicle_features.SIZE
+            return part and replace(part, network=with_more_inputs(part.network, more))
+
+        learned = replace(params, transformer=told(params.transformer), nesam=told(params.nesam))
+        return replace(self, reads_vehicle=True), learned
 
 
 def with_soil(params: VertiWMParams, soil: object) -> VertiWMParams:

@@ -4,6 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import jax
+import jax.numpy as jnp
+
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.mechanics.kinematic import (
@@ -44,8 +47,8 @@ def load_model(
     Args:
         name: which one.
         weights: folder of a fitted model; the one that comes with the package by default.
-        vehicle: of simulator and bicycle, the HMMWV by default. Learned models move the vehicle
-            that they were fitted to.
+        vehicle: which one it moves. By default simulator and bicycle move the HMMWV and learned
+            models the vehicle that they were fitted to; those of one vehicle move no other.
         soil: where NeSAM has soils from, if not from where it had them when it was fitted.
         embeddings: whether histories keep the latents that the Transformer sees, for a policy to
             see them (`dynamics.embedding`). Models without a Transformer keep none.
@@ -62,14 +65,27 @@ def load_model(
     if name == "bicycle":
         driven = vehicle or load_vehicle()
         if driven.skid is not None:
-            return DifferentialDrive(), differential_of(driven, driven.skid)
+            return DifferentialDrive(), differential_of(driven)
         return KinematicBicycle(), bicycle_of(driven)
     folder = Path(weights or files.PRETRAINED)
     found = load_fitted(folder, soil, embeddings, exact_gradient)
     if name not in found:
         raise CheckpointError(f"{folder}: expected {name}, found {' and '.join(found)} alone")
     dynamics, params = found[name]
+    if vehicle is not None and reads_vehicle(dynamics):
+        params = moving(params, vehicle)
     return dynamics, cast_weights(params, compute_dtype)
+
+
+def reads_vehicle(dynamics: Dynamics) -> bool:
+    """Whether a learned model is of many vehicles, of which `moving` gives it one."""
+    part = getattr(dynamics, "nesam", None) or getattr(dynamics, "specialist", None)
+    return getattr(part, "reads_vehicle", False)
+
+
+def moving(params: VertiWMParams, vehicle: Vehicle) -> VertiWMParams:
+    """The parameters of a learned model of another vehicle."""
+    return replace(params, vehicle=jax.tree.map(jnp.asarray, vehicle))
 
 
 def load_fitted(

@@ -1,10 +1,7 @@
 """What specialists read of the vehicle itself, in numbers that do not depend on its size."""
 
-from functools import cache
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle, load_vehicle
 
@@ -20,13 +17,7 @@ def described(vehicle: Vehicle) -> jax.Array:
     By Froude: lengths by a wheel's radius, forces by the weight, times by sqrt(radius / gravity).
     The radius itself comes last.
     """
-    return jnp.clip(_numbers(vehicle) - _reference(), -MOST, MOST)
-
-
-@cache
-def _reference() -> np.ndarray:
-    with jax.ensure_compile_time_eval():
-        return np.asarray(_numbers(load_vehicle()))
+    return jnp.clip(_numbers(vehicle) - _numbers(load_vehicle()), -MOST, MOST)
 
 
 def _numbers(vehicle: Vehicle) -> jax.Array:
