@@ -21,6 +21,7 @@ _APART = {
     "skid_steered",
     "soil_adaptation",
     "turns",
+    "unseen_vehicles",
 }
 """Those that need a GPU, recorded drives, trials or minutes; and what runs another one."""
 _NEEDS = {

@@ -75,6 +75,20 @@ def test_velocities_are_those_of_the_poses(rate, noise, window, largest):
         assert np.std(np.diff(error[:, :3], axis=0) / 0.1) > 2.5 * largest[2]
 
 
+@pytest.mark.parametrize("first", [0.0, 3.0, 7.0])
+def test_poses_that_are_held_make_drives_of_two_seconds(first):
+    """Registered at 10 Hz and logged at 20, as the windows of real robots are."""
+    seen = logged(seconds=2, rate=20, even=True, start=first)
+    held = np.arange(len(seen.time)) // 2 * 2
+    seen = replace(seen, position=seen.position[held], rotation=seen.rotation[held])
+    (drive,) = resample(build(seen), replace(WHOLE, shortest=16), ORIGIN)[0]
+    assert len(drive.control) == 19
+    # Half of the poses are 0.05 s old, at about 3 m/s and 0.5 rad/s.
+    error = errors(drive.state, moments(seen, 19))
+    np.testing.assert_array_less(rms(error), (0.08, 0.012, 0.15, 0.06))
+    np.testing.assert_array_less(np.abs(error[:, 6].mean()), 0.05)
+
+
 def test_dropped_samples_cost_accuracy_and_no_more():
     seen = logged(noise=1)
     kept = np.ones(len(seen.time), bool)

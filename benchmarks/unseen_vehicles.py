@@ -1,0 +1,143 @@
+"""How well vehicles are predicted that no fit has learned from, by what is known of them.
+
+`python -m benchmarks.unseen_vehicles data/wide --model runs/many.../model --vehicles fam_006 uaz`
+reads files `<vehicle>_<kind>_<0 or 1>.npz`. World 1 of each kind is predicted: by the model of many
+vehicles with nothing but what the file says of the vehicle; after it was adapted to 60 s of world
+0; and by what is fitted to these 60 s alone. `--whole` adds a default fit to all of world 0.
+"""
+
+import logging
+from argparse import Namespace
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from benchmarks import recurrent_baseline
+from benchmarks._harness import Figures, parser, report
+from vertiwm_jax import config as configuration
+from vertiwm_jax.dynamics import Dynamics, Params
+from vertiwm_jax.evaluation import prediction, yardsticks
+from vertiwm_jax.evaluation.prediction import TestWindows
+from vertiwm_jax.learning import schema
+from vertiwm_jax.learning.dataset import load_drives, load_file
+from vertiwm_jax.learning.experiment import FitConfig, fit
+from vertiwm_jax.learning.identification import identify
+from vertiwm_jax.learning.pipeline import KINDS
+from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
+from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
+from vertiwm_jax.mechanics.vehicle import VehicleConfig
+from vertiwm_jax.models.config import ModelConfig
+from vertiwm_jax.models.registry import load_model
+
+TRAIN, VALIDATION = 150, 50
+"""Steps of each of three drives, one on each kind of ground: 60 s."""
+ALONE = 600
+"""Updates of what is fitted to these alone."""
+
+
+def gather_logs(data: Path, vehicle: str, folder: Path) -> VehicleConfig:
+    """Writes 60 s of world 0 of each kind to a folder; what its files say of the vehicle."""
+    described = None
+    for kind in KINDS:
+        source = data / f"{vehicle}_{kind}_0.npz"
+        arrays, meta = schema.read(source)
+        drives, _ = load_file(source)
+        (described,) = drives.described
+        assert described is not None, f"{source}: expected a description of the vehicle"
+        row = int(np.argmax(arrays["length"] >= TRAIN + VALIDATION))
+        state, control = arrays["state"][row], arrays["control"][row]
+        ends = (0, TRAIN), (TRAIN, TRAIN + VALIDATION)
+        parts = [schema.drive(state[a : b + 1], control[a:b]) for a, b in ends]
+        found = schema.join(parts) | {"split": np.array(["train", "validation"])}
+        wheels = described.vehicle.wheel_position
+        schema.write(folder / source.name, found, {"map": meta["map"]}, wheels)
+    assert described is not None
+    return described
+
+
+def models(options: Namespace, vehicle: str) -> Iterator[tuple[str, Dynamics, Params]]:
+    """Every row of the table: its name, the model, and its parameters with the vehicle."""
+    folder = options.runs / vehicle
+    logs = link(options.data, [], folder / "logs")
+    described = gather_logs(options.data, vehicle, logs)
+    yield "bicycle", KinematicBicycle(), bicycle_of(described.vehicle)
+    yield "simulator", Simulator(), chrono_like(described.vehicle)
+    for name in ("vertiwm", "nesam"):
+        yield f"{name}, described", *load_model(name, options.model, vehicle=described.vehicle)
+
+    identified = identify(logs, described).vehicle
+    file = folder / "identified.yaml"
+    file.write_text(configuration.dump(identified))
+    yield "simulator, identified", Simulator(), chrono_like(identified.vehicle)
+    yield (
+        "vertiwm, identified",
+        *load_model("vertiwm", options.model, vehicle=identified.vehicle),
+    )
+    given: dict[str, Any] = {"vehicle": str(file), "runs": folder}
+    yield "vertiwm, adapted", *fit(logs, config="adapt", start=options.model, **given)
+    yield "NeSAM, of 60 s alone", *fit(logs, **alone(), **given)
+    yield "recurrent network, of 60 s alone", *recurrent_baseline.fitted([logs], ALONE, folder)
+    if options.whole:
+        names = [f"{vehicle}_{kind}_0.npz" for kind in KINDS]
+        world = link(options.data, names, folder / "world")
+        yield "vertiwm, of world 0", *fit(world, config="fit_chrono", **given)
+
+
+def alone() -> dict[str, Any]:
+    """Settings of a fit of NeSAM without the Transformer, to few drives."""
+    usual = configuration.load(FitConfig, configuration.find("fit_chrono"))
+    unused = replace(usual.soil, updates=0)
+    rollouts = replace(usual.nesam.rollouts, updates=ALONE)
+    nesam = replace(usual.nesam, autoencoders=unused, rollouts=rollouts)
+    return {"model": ModelConfig(parts=("nesam",)), "nesam": nesam, "soil": unused}
+
+
+def predicted(options: Namespace, vehicle: str) -> Iterator[tuple[str, Figures]]:
+    """Errors after 16 steps on world 1, by model."""
+    with TemporaryDirectory() as folder:
+        link(options.data, [f"{vehicle}_{kind}_1.npz" for kind in KINDS], Path(folder))
+        drives, terrain = load_drives(folder, "all", wheels=False)
+    test = TestWindows.of(drives, terrain, context=16, horizon=16, stride=16)
+    for name, dynamics, params in models(options, vehicle):
+        states = prediction.predict(dynamics, params, test).states
+        rows = yardsticks.rows(name, states, test, "all")
+        every = {(row.subset, row.speed_bin): row for row in rows}
+        whole = every["all", None]
+        told = {"position_m": whole.position_m, "low_m": whole.position_m_low}
+        told |= {"high_m": whole.position_m_high, "heading_rad": whole.heading_rad}
+        bins = {f"share of way, {b}": every["all", b].share_of_way for b in yardsticks.SPEEDS}
+        yield f"{vehicle}: {name}", told | {name: x for name, x in bins.items() if x is not None}
+
+
+def link(data: Path, names: list[str], folder: Path) -> Path:
+    """A folder with these files of drives, if any, and the maps of all; it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("maps", *names):
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).symlink_to((data / name).resolve())
+    return folder
+
+
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("data", type=Path)
+    options.add_argument("--model", type=Path, required=True, help="of many vehicles")
+    options.add_argument("--vehicles", nargs="+", default=["fam_006", "fam_009", "uaz"])
+    options.add_argument("--whole", action="store_true")
+    options.add_argument("--runs", type=Path, default=Path("runs/unseen_vehicles"))
+    chosen = options.parse_args()
+    logging.basicConfig(level="INFO", format="%(message)s")
+    results = {}
+    for vehicle in chosen.vehicles:
+        for name, figures in predicted(chosen, vehicle):
+            print(name, f"{figures['position_m']:.3f} m", flush=True)
+            results[name] = figures
+    report("unseen_vehicles", results, chosen.json)
+
+
+if __name__ == "__main__":
+    main()
