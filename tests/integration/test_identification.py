@@ -11,6 +11,8 @@ import vertiwm_jax as vw
 from vertiwm_jax import cli
 from vertiwm_jax import config as configuration
 from vertiwm_jax.config import ConfigError
+from vertiwm_jax.learning import experiment
+from vertiwm_jax.learning.dataset import load_drives
 from vertiwm_jax.learning.identification import MASS, NINETY
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
@@ -86,6 +88,34 @@ def test_a_delay_is_found(drives, tmp_path):
     delay, low, high = vw.identify(late, free=("speed_gain",), horizon=8).delay
     assert low < delay < high
     assert delay == pytest.approx(0.1, abs=0.01)
+
+
+def test_logs_are_imported_first_and_a_model_is_adapted_then(tmp_path, monkeypatch, capsys):
+    time, fitted = 0.1 * np.arange(100), []
+    yaw, speed = 0.1 * time, np.full_like(time, 2.0)
+    x, y = np.cumsum(0.2 * np.cos(yaw)), np.cumsum(0.2 * np.sin(yaw))
+    log, settings, output = tmp_path / "log.csv", tmp_path / "settings.yaml", tmp_path / "my.yaml"
+    names, columns = "time,x,y,yaw,speed,steer", (time, x, y, yaw, speed, 0 * speed + 0.165)
+    np.savetxt(log, np.stack(columns, 1), delimiter=",", header=names, comments="")
+    settings.write_text(
+        "vehicle: {wheelbase: 3.302, track: 1.82, wheel_radius: 0.467}\nplane: concrete\n"
+        "table: {time: time, position: [x, y], yaw: yaw, speed: speed, steering: steer}\n"
+    )
+
+    def run(config):
+        fitted.append(config)
+        return tmp_path / "run"
+
+    monkeypatch.setattr(experiment, "run", run)
+    argv = [str(log), "--output", str(output), "--free", "speed_gain", "--horizon", "4"]
+    with pytest.raises(SystemExit, match=r"map: expected with settings"):
+        cli.main("identify", [*argv, "--map", "map.npz"])
+    cli.main("identify", [*argv, "--settings", str(settings), "--model", "pretrained"])
+    (config,) = fitted
+    assert config.data == (tmp_path / "my.drives",) and config.vehicle == str(output)
+    assert config.model.reads_vehicle and config.start.name == "pretrained"
+    assert len(load_drives(config.data, "all")[0].length) == 1
+    assert f"--weights {tmp_path / 'run' / 'model'}" in capsys.readouterr().out
 
 
 def test_what_cannot_be_identified_is_named(drives):

@@ -1,5 +1,6 @@
 """`vertiwm identify`: numbers of a vehicle from its drives."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,10 +10,13 @@ import tyro
 from vertiwm_jax import atomic, figures
 from vertiwm_jax import config as configuration
 from vertiwm_jax.cli import arguments
-from vertiwm_jax.config import AtLeastOne, Count, settings
+from vertiwm_jax.config import AtLeastOne, ConfigError, Count, settings
 from vertiwm_jax.evaluation import plots
 from vertiwm_jax.evaluation.tables import Row, markdown
-from vertiwm_jax.learning import identification
+from vertiwm_jax.importers.imports import import_drives
+from vertiwm_jax.learning import experiment, identification
+from vertiwm_jax.learning.dataset import FITTED, SplitConfig
+from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.learning.identification import MASS, Identified
 from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.state import STEP_SECONDS
@@ -21,18 +25,31 @@ from vertiwm_jax.state import STEP_SECONDS
 @settings
 class Identify:
     """Find numbers of a vehicle with which the built-in simulator predicts its drives best, and how
-    well drives tell them."""
+    well drives tell them; and adapt a model to it."""
 
     drives: tyro.conf.Positional[Annotated[tuple[Path, ...], AtLeastOne]]
-    """Folders of drives, as `collect` and `import_drives` write them."""
+    """Folders of drives, as `collect` and `import_drives` write them; or, with `settings`, logs."""
     output: Path
     """YAML file of the vehicle to write, for `--vehicle` of other commands."""
+    settings: Path | None = None
+    """What is given are logs, which this file describes to `import_drives`. Their drives are
+    written to a folder beside `output`, whose name ends in `.drives`."""
+    map: Path | None = None
+    """The ground of logs, as of `import_drives`."""
     vehicle: str = HMMWV
     """Numbers to begin with: the name of a shipped vehicle, or a YAML file of one."""
     free: Annotated[tuple[str, ...], AtLeastOne] = identification.FREE
     """Which of its numbers to find."""
     horizon: Count = 16
     """Steps of 0.1 s that are predicted."""
+    splits: SplitConfig = FITTED
+    """How drives are shared out whose files do not say what they are for; those to train are used,
+    and to adapt also those for validation."""
+    model: Path | None = None
+    """Folder of a model of many vehicles, or `pretrained`, to adapt to this one by
+    `configs/adapt.yaml`."""
+    runs: Path = Path("runs")
+    """Folder in which the folder of the adapted model is made."""
     picture: Path | None = None
     """File of a picture to write: numbers with their intervals, and errors before and after."""
 
@@ -42,14 +59,28 @@ def run(name: str, words: list[str]) -> None:
     for path in (command.output, command.picture):
         if path is not None:
             atomic.expect_file(path)
-    asked = {"free": command.free, "horizon": command.horizon}
-    found = identification.identify(command.drives, command.vehicle, **asked)
+    if command.map is not None and command.settings is None:
+        raise ConfigError("map: expected with settings, as drives have maps of their own")
+    drives = command.drives
+    if command.settings is not None:
+        folder = command.output.with_suffix(".drives")
+        print(import_drives(drives, folder, command.settings, map=command.map))
+        drives = (folder,)
+    asked = {"free": command.free, "horizon": command.horizon, "splits": command.splits}
+    found = identification.identify(drives, command.vehicle, **asked)
     atomic.write(command.output, configuration.dump(found.vehicle))
     if command.picture is not None:
         figures.save(plots.identified(found), command.picture)
     print("\n".join(_told(found)))
+    model = "--model builtin"
+    if command.model is not None:
+        adapt = configuration.load(FitConfig, configuration.find("adapt"))
+        changed = {"data": drives, "start": command.model, "runs": command.runs}
+        vehicle = str(command.output)
+        run = experiment.run(replace(adapt, splits=command.splits, vehicle=vehicle, **changed))
+        model = f"--weights {run / 'model'}"
     print(f"the vehicle is in {command.output}; to train with it:")
-    print(f"python -m vertiwm_jax.ppo --model builtin --vehicle {command.output}")
+    print(f"python -m vertiwm_jax.ppo {model} --vehicle {command.output}")
 
 
 def _told(found: Identified) -> list[str]:

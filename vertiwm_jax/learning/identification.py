@@ -19,7 +19,7 @@ from vertiwm_jax.geometry import wrap
 from vertiwm_jax.importers import delay as delays
 from vertiwm_jax.importers.delay import Response
 from vertiwm_jax.learning import windows
-from vertiwm_jax.learning.dataset import FITTED, Drives, load_drives
+from vertiwm_jax.learning.dataset import FITTED, Drives, SplitConfig, load_drives
 from vertiwm_jax.learning.objectives import open_loop
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics import vehicle as vehicles
@@ -109,6 +109,7 @@ def identify(
     *,
     free: Sequence[str] = FREE,
     horizon: int = 16,
+    splits: SplitConfig = FITTED,
 ) -> Identified:
     """Finds numbers of a vehicle with which the simulator predicts its drives best.
 
@@ -124,6 +125,7 @@ def identify(
             are.
         free: which fields of `VehicleConfig` to find; pairs get one factor.
         horizon: steps of 0.1 s that are predicted.
+        splits: how drives are shared out whose files do not say it; those to train are used.
 
     Returns:
         The vehicle (`config.save` writes it as a YAML file), and how well its numbers are known.
@@ -139,7 +141,7 @@ def identify(
         numbers = value if isinstance(value, tuple) else (value,)
         if not all(isinstance(x, float) for x in numbers):
             raise ConfigError(f"free: {name}: expected a field of numbers, found {value!r}")
-    recorded, terrain = load_drives(drives, "train", FITTED)
+    recorded, terrain = load_drives(drives, "train", splits, wheels=False)
     recorded.expect_steered_by(begin)
     context = min(_CONTEXT, max(int(np.max(recorded.length)) - horizon, 0))
     index = windows.index(recorded, terrain, context, horizon, horizon)
