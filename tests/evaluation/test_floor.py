@@ -61,8 +61,3 @@ def test_the_floor_is_told_as_prediction_errors_are(tmp_path):
 def test_drives_that_are_too_short_are_refused():
     with pytest.raises(DataError, match="expected drives of at least 503 steps"):
         FloorTest((DRIVES,), split="train", every=9, context=CONTEXT, horizons=(500,)).run()
-
-
-def test_chrono_has_one_vehicle():
-    with pytest.raises(ValueError, match="vehicle: expected hmmwv in Chrono, found rover"):
-        FloorTest((DRIVES,), simulator="chrono", vehicle="rover")

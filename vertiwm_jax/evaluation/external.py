@@ -9,14 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env import episodes
 from vertiwm_jax.env.agent import Agent, Policy, as_agent
 from vertiwm_jax.env.episodes import NavigationResult
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import TaskParams
-from vertiwm_jax.mechanics.vehicle import HMMWV
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl.experiment import TaskConfig
 from vertiwm_jax.runs import Progress
@@ -33,9 +31,7 @@ Arena = ModelName | Literal["chrono"]
 def expect(arena: Arena, config: TaskConfig) -> None:
     """Raises `SimulatorError` or `ConfigError` where no test with these settings is possible."""
     if arena == "chrono":
-        chrono.modules()
-        if config.vehicle != HMMWV:
-            raise ConfigError(f"vehicle: expected {HMMWV} in Chrono, found {config.vehicle}")
+        chrono.expect(config.driven)
 
 
 def evaluate(

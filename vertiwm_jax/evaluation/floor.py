@@ -17,7 +17,7 @@ from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.dataset import Drives, SplitConfig, WheelSignals
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.mechanics import vehicle
-from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle
+from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.simulators import chrono, collection, processes
 from vertiwm_jax.simulators.builtin import BuiltIn
@@ -44,7 +44,7 @@ class FloorTest:
     data: tuple[Path, ...]
     """Folders of `.npz` files of drives, with the maps they name."""
     simulator: Literal["builtin", "chrono"] = "builtin"
-    """What moves the vehicle; Chrono needs PyChrono, and has the HMMWV alone."""
+    """What moves the vehicle; Chrono needs PyChrono."""
     vehicle: str = HMMWV
     """Name of a shipped vehicle, or a YAML file of one."""
     split: dataset.Split = "test"
@@ -64,18 +64,13 @@ class FloorTest:
     json: Path | None = None
     """File for the errors as a JSON list of rows, as of `evaluate prediction`."""
 
-    def check(self):
-        if self.vehicle != HMMWV and self.simulator == "chrono":
-            raise ValueError(f"vehicle: expected {HMMWV} in Chrono, found {self.vehicle}")
-
     def run(self) -> str:
         """Drives, and writes what is asked for; returns the tables as Markdown."""
+        driven = vehicle.load(self.vehicle)
         if self.simulator == "chrono":
-            chrono.modules()
-        numbers = vehicle.load(self.vehicle)
+            chrono.expect(driven)
         recorded, terrain = dataset.load_drives(self.data, self.split, self.splits)
-        recorded.expect_steered_by(numbers)
-        driven = numbers.vehicle
+        recorded.expect_steered_by(driven)
         steps, rng = self.context + max(self.horizons), np.random.default_rng(self.seed)
         chosen = range(0, len(recorded.length), self.every)
         tasks = [_task(recorded, terrain, number, steps, rng) for number in chosen]
@@ -123,7 +118,7 @@ def _task(
     return alone, np.asarray(recorded.state)[number, 0, [0, 1, 5]], control, APART * np.array(sides)
 
 
-def twice(simulator: str, driven: Vehicle, context: int, task: _Task) -> tuple[Drive, Drive]:
+def twice(simulator: str, driven: VehicleConfig, context: int, task: _Task) -> tuple[Drive, Drive]:
     """The same drive twice, of which the second is moved and pushed after the context.
 
     task: a map with the world selected; x, y, m, and yaw, rad, of the start; commands `[T, 2]`;
@@ -131,7 +126,8 @@ def twice(simulator: str, driven: Vehicle, context: int, task: _Task) -> tuple[D
     """
     terrain, start, control, offset = task
     terrain = jax.device_put(terrain)
-    moved = Chrono(terrain) if simulator == "chrono" else BuiltIn(terrain, driven)
+    in_chrono = simulator == "chrono"
+    moved = Chrono(terrain, driven) if in_chrono else BuiltIn(terrain, driven.vehicle)
     over = partial(collection.ending, *within(terrain, MARGIN))
 
     def driving(offset: np.ndarray) -> Drive:

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -196,12 +197,13 @@ def drive(
     env, task = experiment.environment(config, model, terrain, tasks)
     _log.info("driving %d tasks on %d worlds ...", task.pool_size, terrain.worlds)
     results = {}
+    chrono = partial(Chrono, driven=config.driven)
     with processes.simulating(jobs) as mapped:
         for name, policy in policies.items():
             start = time.perf_counter()
             inputs = env, task, policy, key
             if simulator == "chrono":
-                results[name] = external.evaluate(Chrono, mapped, tasks, *inputs)
+                results[name] = external.evaluate(chrono, mapped, tasks, *inputs)
             else:
                 results[name] = run_episodes(*inputs)
             solved, seconds = int(np.sum(results[name].success)), time.perf_counter() - start

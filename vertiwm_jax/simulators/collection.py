@@ -86,8 +86,6 @@ class CollectConfig:
     def check(self):
         if self.obstacles and not (self.terrain and self.simulator == "chrono"):
             raise ValueError("obstacles: are solid in Chrono alone, and are those of given worlds")
-        if self.vehicle != HMMWV and self.simulator == "chrono":
-            raise ValueError(f"vehicle: expected {HMMWV} in Chrono, found {self.vehicle}")
         WorldConfig(self.difficulties, self.kinds)
 
     @property
@@ -102,10 +100,10 @@ Learned = tuple[Policy, NavigationConfig, Encoders | None]
 
 def collect(config: CollectConfig) -> None:
     """Records what the folder lacks, a world after the other."""
-    if config.simulator == "chrono":
-        chrono.modules()
-    _expect(config)
     driven = vehicle.load(config.vehicle)
+    if config.simulator == "chrono":
+        chrono.expect(driven)
+    _expect(config)
     learned = _learned(config, driven)
     terrain = _terrain(config, driven.scale)
     _claim(config)
@@ -122,7 +120,7 @@ def collect(config: CollectConfig) -> None:
     _log.info("%d of %d worlds are left", len(missing), terrain.worlds)
     began, done = time.monotonic(), 0
     with processes.simulating(config.jobs) as mapped, Progress(total, "steps") as progress:
-        found = mapped(partial(record, config, driven.vehicle, learned), tasks)
+        found = mapped(partial(record, config, driven, learned), tasks)
         for world in missing:
             drives = []
             for one in islice(found, config.drives):
@@ -149,7 +147,7 @@ def collect(config: CollectConfig) -> None:
 
 def record(
     config: CollectConfig,
-    driven: Vehicle,
+    driven: VehicleConfig,
     learned: Learned | None,
     task: tuple[TerrainMap, int, int],
 ) -> Drive:
@@ -161,14 +159,15 @@ def record(
     terrain, world, number = task
     terrain, tries = jax.device_put(terrain), []
     over = partial(ending, *within(terrain, MARGIN))
-    simulator = Chrono(terrain) if config.simulator == "chrono" else BuiltIn(terrain, driven)
+    in_chrono, numbers = config.simulator == "chrono", driven.vehicle
+    simulator = Chrono(terrain, driven) if in_chrono else BuiltIn(terrain, numbers)
     for attempt in range(ATTEMPTS):
         rng = np.random.default_rng([config.seed, world, number, attempt])
         start = excitation.start(rng, terrain, config.seconds)
         if learned:
-            pilot = to_goals(learned, driven, terrain, start, rng)
+            pilot = to_goals(learned, numbers, terrain, start, rng)
         else:
-            pilot = excitation.sinusoids(rng, config.steps, float(driven.steering_limit))
+            pilot = excitation.sinusoids(rng, config.steps, float(numbers.steering_limit))
         tries.append(drive(simulator, start, pilot, config.steps, over))
         if len(tries[-1].control) >= SHORTEST * config.steps:
             break
