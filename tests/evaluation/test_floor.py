@@ -8,7 +8,7 @@ from vertiwm_jax.evaluation import floor
 from vertiwm_jax.evaluation.floor import FloorTest
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.schema import DataError
-from vertiwm_jax.mechanics.vehicle import load_vehicle
+from vertiwm_jax.mechanics.vehicle import HMMWV, load
 
 DRIVES = Path(__file__).parents[1] / "data" / "chrono_drives"
 CONTEXT = 3
@@ -25,14 +25,14 @@ def test_the_second_vehicle_parts_after_the_context():
     offset = given[-1]
     assert np.linalg.norm(offset[:3]) == pytest.approx(1e-3)
     assert np.linalg.norm(offset[3:]) == pytest.approx(1e-3)
-    first, second = floor.twice("builtin", load_vehicle(), CONTEXT, given)
+    first, second = floor.twice("builtin", load(HMMWV), CONTEXT, given)
     states = [np.stack([seen.state for seen in one.observations]) for one in (first, second)]
     assert len(states[0]) == len(states[1]) == 13
     np.testing.assert_array_equal(states[0][: CONTEXT + 1], states[1][: CONTEXT + 1])
     apart = np.linalg.norm((states[0] - states[1])[CONTEXT + 1 :, :3], axis=1)
     assert np.all((apart > 2e-4) & (apart < 1e-2))
     # They part by nothing else.
-    still = floor.twice("builtin", load_vehicle(), CONTEXT, (*given[:-1], np.zeros(6)))
+    still = floor.twice("builtin", load(HMMWV), CONTEXT, (*given[:-1], np.zeros(6)))
     for one, other in zip(still[0].observations, still[1].observations, strict=True):
         np.testing.assert_array_equal(one.state, other.state)
 

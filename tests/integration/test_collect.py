@@ -156,7 +156,7 @@ def test_drives_that_end_early_are_tried_again(maps, monkeypatch):
 
     monkeypatch.setattr(collection, "drive", short)
     command = collection.CollectConfig(output=maps, seconds=1.0)
-    first = command, load_vehicle(), None, (files.load_map(maps), 0, 0)
+    first = command, vehicle.load("hmmwv"), None, (files.load_map(maps), 0, 0)
     assert len(collection.record(*first).control) == 3 and len(set(tried)) == 6
     with pytest.raises(SimulatorError, match="world 0: drive 0: expected a step or more"):
         collection.record(*first)
@@ -265,7 +265,7 @@ def test_a_policy_drives_from_goal_to_goal(maps, encoders):
     assert np.linalg.norm(np.diff(goals, axis=0), axis=-1).min() >= 20
     command = collection.CollectConfig(output=maps, seconds=2.0)
     alone = jax.device_get(terrain.subset(np.array([0])))
-    found = collection.record(command, load_vehicle(), learned, (alone, 0, 1))
+    found = collection.record(command, vehicle.load("hmmwv"), learned, (alone, 0, 1))
     assert found.control.shape == (20, 2) and np.all(found.control[:, 0] == 2.5)
 
 
@@ -310,7 +310,7 @@ def test_a_rover_drives_at_full_size(maps, tmp_path):
         door("collect"), "--output", tmp_path / "drives", "--terrain", tmp_path / "maps"
     )
     assert message.endswith("config.yaml: vehicle: expected rover as before, found hmmwv")
-    for argv in (["--vehicle", "rovr"], ["--vehicle", "rover", "--simulator", "chrono"]):
+    for argv in (["--vehicle", "rovr"], ["--vehicle", "husky", "--simulator", "chrono"]):
         with pytest.raises(SystemExit) as stop:
             door("collect")(["--output", str(tmp_path / "other"), *argv])
         assert stop.value.code
