@@ -19,10 +19,10 @@ import numpy as np
 from benchmarks._harness import parser, report
 from vertiwm_jax.dynamics import rollout
 from vertiwm_jax.learning import schema
-from vertiwm_jax.learning.identification import MASS, Number, identify
+from vertiwm_jax.learning.identification import MASS, PRIORS, Number, identify
 from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.simulator import Simulator, SimulatorParams, chrono_like
-from vertiwm_jax.mechanics.vehicle import HMMWV, PRIORS, VehicleConfig, load
+from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig, load
 from vertiwm_jax.state import STEP_SECONDS, Command
 from vertiwm_jax.terrain import files, worlds
 from vertiwm_jax.terrain.map import TerrainMap

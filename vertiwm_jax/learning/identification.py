@@ -1,7 +1,7 @@
 """A vehicle's numbers found from its drives, with the built-in simulator as the model."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import mul
@@ -24,11 +24,23 @@ from vertiwm_jax.learning.objectives import open_loop
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics import vehicle as vehicles
 from vertiwm_jax.mechanics.simulator import Simulator, SimulatorParams, chrono_like
-from vertiwm_jax.mechanics.vehicle import HMMWV, PRIORS, VehicleConfig
+from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
 from vertiwm_jax.precision import float32
 from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.map import TerrainMap
 
+PRIORS: Mapping[str, float] = {
+    "inertia": 0.3,
+    "spring": 0.3,
+    "damper": 0.5,
+    "steering_rate": 0.5,
+    "speed_gain": 0.5,
+    "wheel_torque": 0.5,
+    "wheel_power": 0.5,
+    "brake_torque": 0.5,
+    "tyre_friction": 0.2,
+}
+"""Standard deviations of the logarithm of what a person gives for a number, by field."""
 FREE = tuple(PRIORS)
 MASS = 0.1
 """The same of the mass, which drives do not tell: only how large forces are beside it."""

@@ -15,7 +15,7 @@ from vertiwm_jax.learning import augment, windows
 from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.learning.objectives import Objective, open_loop
 from vertiwm_jax.learning.windows import GROUNDS, WindowIndex, Windows
-from vertiwm_jax.mechanics.vehicle import PRIORS, Vehicle, VehicleConfig
+from vertiwm_jax.mechanics.vehicle import Vehicle, VehicleConfig
 from vertiwm_jax.terrain.map import TerrainMap
 
 
@@ -35,10 +35,6 @@ class WindowConfig:
     """How often a window on rigid ground, on soil and across both is drawn, relatively."""
     mirror: bool = True
     """Whether half of those drawn are replaced by their mirror images."""
-    vehicle_noise: NotNegative = 0.0
-    """How wrong numbers of the vehicle are while a model of many learns, as a share of how wrong
-    guesses are (`mechanics.vehicle.PRIORS`); so it learns to see by the last steps how a vehicle
-    moves, and does not know those it learned from by their numbers."""
     validation: Count = 256
     """Largest number of windows of each kind of ground to validate on."""
 
@@ -118,20 +114,13 @@ class WindowProblem:
             batch = augment.mirror_some(mirror_key, batch, data.terrain)
 
         def one(
-            params: Params,
-            terrain: TerrainMap,
-            vehicles: Vehicle | None,
-            window: Windows,
-            key: jax.Array,
+            params: Params, terrain: TerrainMap, vehicles: Vehicle | None, window: Windows
         ) -> jax.Array:
             own = driven_in(params, vehicles, window.world)
-            if self.config.vehicle_noise:
-                own = replace(own, vehicle=guessed(own.vehicle, self.config.vehicle_noise, key))
             return self.objective(own, terrain.select(window.world), window)
 
-        every = parallel.vmap(one, (None, None, None, 0, 0))
-        keys = jax.random.split(jax.random.fold_in(key, 2), self.config.batch)
-        return jnp.mean(every(params, data.terrain, data.vehicles, batch, keys))
+        every = parallel.vmap(one, (None, None, None, 0))
+        return jnp.mean(every(params, data.terrain, data.vehicles, batch))
 
     def validate(self, params: Params, data: WindowData) -> dict[str, jax.Array]:
         """Position errors, m; a prediction that is not finite counts as not having moved."""
@@ -161,13 +150,6 @@ def driven_in(params: Params, vehicles: Vehicle | None, world: jax.Array) -> Par
     if vehicles is None:
         return params
     return replace(params, vehicle=vehicles.select(world % len(vehicles.mass)))
-
-
-def guessed(vehicle: Vehicle, share: float, key: jax.Array) -> Vehicle:
-    """A vehicle whose numbers are off by a share of what guesses are usually (`PRIORS`)."""
-    off = share * jax.random.normal(key, (len(PRIORS),))
-    factors = dict(zip(PRIORS, jnp.exp(off * jnp.array(list(PRIORS.values()))), strict=True))
-    return replace(vehicle, **{name: getattr(vehicle, name) * by for name, by in factors.items()})
 
 
 def _spread(ground: np.ndarray, most: int) -> np.ndarray:

@@ -1,6 +1,6 @@
 """A four-wheeled vehicle: masses, suspension, drivetrain, speed controller and limits."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -21,20 +21,6 @@ GRAVITY = 9.81
 HMMWV = "hmmwv"
 """Name of the default vehicle."""
 _AXLES = {"all": (1, 1, 1, 1), "rear": (0, 0, 1, 1), "front": (1, 1, 0, 0), "none": (0, 0, 0, 0)}
-
-
-PRIORS: Mapping[str, float] = {
-    "inertia": 0.3,
-    "spring": 0.3,
-    "damper": 0.5,
-    "steering_rate": 0.5,
-    "speed_gain": 0.5,
-    "wheel_torque": 0.5,
-    "wheel_power": 0.5,
-    "brake_torque": 0.5,
-    "tyre_friction": 0.2,
-}
-"""Standard deviations of the logarithm of what a person gives for a number, by field."""
 
 
 @struct.dataclass
