@@ -15,7 +15,7 @@ from vertiwm_jax.rl.experiment import PPOTraining
 
 FOLDER = Path(__file__).parents[1] / "configs"
 KINDS = {"table3": CompareConfig, "import_nedm": ImportSettings} | dict.fromkeys(
-    ["fit_chrono", "fit_paper", "fine_tune", "gates", "adapt"], FitConfig
+    ["fit_chrono", "fit_paper", "fine_tune", "gates", "adapt", "any_vehicle"], FitConfig
 )
 
 

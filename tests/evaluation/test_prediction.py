@@ -289,8 +289,8 @@ def test_predictions_are_of_the_selected_worlds():
 
 @pytest.mark.integration
 def untrained():
-    """NeSAM of many vehicles, which has learned nothing beside physics."""
-    config = ModelConfig(parts=("nesam",), terrain="none", reads_vehicle=True)
+    """NeSAM, which has learned nothing beside physics."""
+    config = ModelConfig(parts=("nesam",), terrain="none", vehicles="any")
     params = config.init_params(jax.random.key(0), chrono_like(load_vehicle()))
     model = Alone(config.nesam)
     return model, Partial(moving, with_soil(model.part_of(params), None))

@@ -28,10 +28,8 @@ pytestmark = pytest.mark.slow
 FILES = {
     **{name: (TRAININGS["ppo"], name) for name in ("ppo", "ppo_small", "ppo_paper")},
     **{name: (TRAININGS[name], name) for name in ("sac", "td3")},
-    **{
-        name: (FitConfig, name)
-        for name in ("fit_chrono", "fit_paper", "fine_tune", "gates", "adapt")
-    },
+    **{name: (FitConfig, name) for name in ("fit_chrono", "fit_paper", "fine_tune", "gates")},
+    **{name: (FitConfig, name) for name in ("adapt", "any_vehicle")},
     "table3": (CompareConfig, "table3"),
     "import_nedm": (ImportSettings, "import_nedm"),
     "rover": (VehicleConfig, "vehicles/rover"),

@@ -24,7 +24,6 @@ from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
 from vertiwm_jax.training import Seeds
-from vertiwm_jax.world_model import vehicle_features
 
 OPEN = Path(__file__).parents[2] / "data" / "open"
 
@@ -66,16 +65,6 @@ def test_arrays_without_elements_are_spread_too(two):
     args = jnp.zeros((3, 0)), jnp.zeros((8, 2, 0), jnp.int32), jnp.arange(8.0)
     given = devices_of(two, parallel.vmap(function, (None, 0, 0)), *args)
     chex.assert_trees_all_close(given, jnp.arange(8.0) + 5)
-
-
-def test_vehicles_are_described_alike_on_every_device(two):
-    masses = jnp.linspace(1e3, 4e3, 16)
-
-    def function(mass):
-        return vehicle_features.described(replace(load_vehicle(), mass=mass))
-
-    spread = parallel.vmap(function, (0,))
-    chex.assert_trees_all_close(devices_of(two, spread, masses), spread(masses), atol=1e-6)
 
 
 @pytest.mark.parametrize(("half", "faster"), [(0.55, True), (0.9, False), (1.6, False)])

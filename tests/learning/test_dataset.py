@@ -334,7 +334,7 @@ def test_each_world_has_the_vehicle_that_its_file_describes(tmp_path):
         meta = np.array(json.dumps({"map": "hill.npz", "vehicle": said}))
         write(tmp_path, f"{name}.npz", meta=meta)
     loaded, terrain = dataset.load_drives(tmp_path, "test")
-    driven = loaded.driven(vehicle.load("hmmwv"))
+    driven = loaded.driven(vehicle.load_vehicle())
     assert driven.mass.shape == (terrain.worlds,)
     np.testing.assert_allclose(driven.mass, [2800.0, 2493.6])
     own = driven.select(loaded.world[0])
@@ -400,7 +400,9 @@ def test_a_fit_leaves_the_unseen_worlds_out(tmp_path):
     (found,) = pipeline.expect_drives(config)
     assert found.left_out == {folder / "mixed_015.npz": "open/mixed/mixed_015"}
     for split, count in (("train", 20), ("validation", 2)):
-        loaded, terrain = pipeline._Pipeline(config, None, (), True).load(("mixed",), split)
+        loaded, terrain = pipeline._Pipeline(config, None, (), True, vehicle.load_vehicle()).load(
+            ("mixed",), split
+        )
         assert len(loaded.state) == count and terrain.worlds == 1
     misspelt = SplitConfig(leave_out=("mixed/mixed_17",))
     with pytest.raises(DataError, match=r"leave_out: .* found mixed/mixed_17, which is not in"):

@@ -152,7 +152,7 @@ def test_each_window_is_of_the_vehicle_that_drove_there(recorded):
             masses = jnp.array([*(each.mass for each in heavy[:-1]), hmmwv.mass])
             return (params.vehicle.mass == masses[window.world % 3]).astype(jnp.float32)
 
-    data = WindowData.of(CONFIG, (drives, terrain), (drives, terrain), otherwise=hmmwv)
+    data = WindowData.of(CONFIG, (drives, terrain), (drives, terrain), otherwise=hmmwv.vehicle)
     problem = WindowProblem(BICYCLE, Mass(), replace(CONFIG, batch=500))
     assert float(problem.loss(chrono_like(load_vehicle()), data, jax.random.key(0))) == 1
 

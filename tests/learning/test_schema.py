@@ -159,7 +159,7 @@ def test_files_of_skid_steered_vehicles_tell_yaw_rates(tmp_path):
     assert found.turn == "yaw_rate" and np.asarray(found.control)[0, 0, 1] == 5.0
     found.expect_steered_by(vehicle.load("husky"))
     with pytest.raises(DataError, match=r"vehicle: expected one skid-steered, .* yaw rate, found"):
-        found.driven(vehicle.load("hmmwv"))
+        found.driven(vehicle.load("hmmwv").vehicle)
     write(tmp_path, control=broken("control", (0, 3, 1), 40.0), meta=skid())
     with pytest.raises(DataError, match="control: expected finite commanded yaw rate in rad/s"):
         dataset.load_drives(tmp_path, "all")

@@ -29,13 +29,7 @@ from vertiwm_jax.mechanics.kinematic import (
 )
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.models.config import SoilSource
-from vertiwm_jax.models.registry import (
-    ModelName,
-    load_fitted,
-    load_model,
-    moving,
-    reads_vehicle,
-)
+from vertiwm_jax.models.registry import ModelName, load_fitted, load_model, moves_any, moving
 from vertiwm_jax.runs import Progress
 from vertiwm_jax.world_model.fusion import COEFFICIENTS
 
@@ -64,8 +58,9 @@ class PredictionTest:
     weights: Path | None = None
     """Folder of a fitted model, instead of the one that comes with the package."""
     vehicle: str | None = None
-    """What the built-in simulator and the bicycle drive: the name of a shipped vehicle, or a YAML
-    file of one; by default the vehicle that each file of drives describes, or else the HMMWV."""
+    """What the built-in simulator, the bicycle and learned models of any vehicle drive: the name
+    of a shipped vehicle, or a YAML file of one. By default the vehicle that each file of drives
+    describes, or else the HMMWV, and of learned models the one that they were fitted to."""
     soil: SoilSource | None = None
     """Where the models have soils from, if not from where they had them when they were fitted."""
     compare: tuple[Path, ...] = ()
@@ -96,7 +91,7 @@ class PredictionTest:
         for collection in collections:
             _log.info("%s; predicted: %s", collection, split)
         dataset.expect_drives(collections, split, self.context + max(self.horizons))
-        given = vehicle.load(self.vehicle or vehicle.HMMWV)
+        given = vehicle.load(self.vehicle or vehicle.HMMWV).vehicle
         learned: dict[str, tuple[Dynamics, Params]] = {
             name: load_model(name, self.weights, soil=self.soil)
             for name in self.models
@@ -109,12 +104,12 @@ class PredictionTest:
         if self.vehicle:
             drives = replace(drives, described=(None,) * terrain.worlds)
         driven = drives.driven(given)
+        known = bool(self.vehicle) or any(drives.described)
         models: dict[str, tuple[Dynamics, Params | Partial]] = {}
         for name, (dynamics, params) in learned.items():
-            if reads_vehicle(dynamics):
-                models[name] = dynamics, Partial(moving, params)
-            elif (params.vehicle.skid is None) == (driven.skid is None):
-                models[name] = dynamics, params
+            if params.vehicle.turn == drives.turn:
+                own = known and moves_any(dynamics)
+                models[name] = dynamics, Partial(moving, params) if own else params
             else:
                 _log.info("%s is left out: it drives a vehicle that is steered otherwise", name)
         models["builtin"] = Simulator(), Partial(chrono_like)

@@ -88,19 +88,19 @@ class Drives:
     described: tuple[VehicleConfig | None, ...] = struct.field(default=(), pytree_node=False)
     turn: Turn = struct.field(default="steering", pytree_node=False)
 
-    def driven(self, otherwise: VehicleConfig) -> Vehicle:
+    def driven(self, otherwise: Vehicle) -> Vehicle:
         """The vehicles that drove, leaves `[W, ...]`, to `select` by world.
 
         otherwise: where a file describes none.
 
         Raises `DataError` unless they are steered as the drives were.
         """
-        every = [own or otherwise for own in self.described]
+        every = [own.vehicle if own else otherwise for own in self.described]
         for each in every:
             self.expect_steered_by(each)
-        return vehicle.stack([each.vehicle for each in every])
+        return vehicle.stack(every)
 
-    def expect_steered_by(self, driven: VehicleConfig) -> None:
+    def expect_steered_by(self, driven: Vehicle | VehicleConfig) -> None:
         """Raises `DataError` unless a vehicle takes such commands as the drives have."""
         if driven.turn != self.turn:
             kinds = {"steering": "with front wheels that steer", "yaw_rate": "skid-steered"}

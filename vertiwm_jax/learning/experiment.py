@@ -33,8 +33,8 @@ class FitConfig(PipelineConfig):
     """Folder of an earlier run to go on with; stages that have ended are not repeated."""
     start: Path | None = None
     """Folder of a fitted model to go on from, or `pretrained`: it is fitted further by open-loop
-    predictions; its encoders and constants stay. It may have fewer gates than `model.gates`, and
-    know one vehicle where `model.reads_vehicle` is of many."""
+    predictions; its encoders and constants stay. It may have fewer gates than `model.gates`,
+    and be of one vehicle where `model.vehicles` is any."""
     wandb: str | None = None
     """Project of Weights & Biases that gets the metrics too; needs the package `wandb`."""
     compile_cache: Path | None = None
@@ -103,8 +103,8 @@ def _start(config: FitConfig) -> VertiWMParams | None:
         return None
     pretrained = config.start == Path("pretrained")
     found, params = files.load(files.PRETRAINED if pretrained else config.start)
-    if config.model.reads_vehicle and not found.reads_vehicle:
-        found, params = found.reading_vehicles(params)
+    if config.model.vehicles == "any":
+        found = replace(found, vehicles="any")
     if found.gates > config.model.gates or replace(found, gates=config.model.gates) != config.model:
         raise ConfigError(f"{config.start}: expected {config.model}, found {found}")
     return params

@@ -21,13 +21,13 @@ from vertiwm_jax.learning.dataset import Collection, Drives, Split, SplitConfig
 from vertiwm_jax.learning.fitting import FitConfig, Problem
 from vertiwm_jax.learning.losses import LossConfig
 from vertiwm_jax.learning.objectives import RolloutLoss, TeacherForcingLoss
-from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
+from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem, described
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.learning.stages import Inputs
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import chrono_like
-from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig, load_vehicle
+from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
 from vertiwm_jax.models.config import ModelConfig, with_soil
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.runs import Run
@@ -94,8 +94,8 @@ class PipelineConfig:
     """What is fitted."""
     vehicle: str | None = None
     """The vehicle whose physics NeSAM corrects: the name of a shipped one, or a YAML file.
-    By default that of the model to go on from, or else the HMMWV. A model of many vehicles
-    (`model.reads_vehicle`) takes those that files of drives describe, and this one elsewhere."""
+    By default that of the model to go on from, or else the HMMWV; and of a model of any vehicle
+    (`model.vehicles`) the one that each file of drives describes, where it does."""
     windows: WindowConfig = WindowConfig(weights=(1.0, 1.0, 2.0))
     """Which windows of the drives are learned from."""
     loss: LossConfig = LossConfig(velocity=0.05)
@@ -186,10 +186,11 @@ def fit(config: PipelineConfig, run: Run, start: VertiWMParams | None = None) ->
     if start is not None:
         start = start if driven is None else replace(start, vehicle=jax.device_put(driven.vehicle))
         begun = (stages.digest(start),)
-    pipeline, key = _Pipeline(config, run, begun, start is None), jax.random.key(config.seed)
+    moved = driven.vehicle if driven else load_vehicle() if start is None else start.vehicle
+    pipeline, key = _Pipeline(config, run, begun, start is None, moved), jax.random.key(config.seed)
     if start is None:
         constants = calibration.normalization(pipeline.load(KINDS, "train")[0])
-        physics = chrono_like(driven.vehicle if driven else load_vehicle())
+        physics = chrono_like(moved)
         params = config.model.init_params(key, physics, constants)
     else:
         params = config.model.with_gates(start, key)
@@ -205,7 +206,8 @@ def fit(config: PipelineConfig, run: Run, start: VertiWMParams | None = None) ->
 class _Pipeline:
     """What the stages of a fit share.
 
-    begun: what is known of the parameters that it begins with. before: what the next stage builds
+    begun: what is known of the parameters that it begins with. driven: the vehicle of all drives,
+    or where files describe none. before: what the next stage builds
     on, by the digests of earlier ones. loaded: drives that were read.
     """
 
@@ -213,6 +215,7 @@ class _Pipeline:
     run: Run
     begun: tuple[str, ...]
     from_nothing: bool
+    driven: Vehicle
     before: tuple[str, ...] = ()
     loaded: dict[Any, tuple[Drives, TerrainMap]] = field(default_factory=dict)
 
@@ -335,10 +338,10 @@ class _Pipeline:
         return WindowData.of(config, *drives, otherwise=self._otherwise)
 
     @property
-    def _otherwise(self) -> VehicleConfig | None:
-        """The vehicle where files describe none, of a model of many vehicles."""
-        of_many = self.config.model.reads_vehicle
-        return vehicle.load(self.config.vehicle or HMMWV) if of_many else None
+    def _otherwise(self) -> Vehicle | None:
+        """The vehicle where files describe none; None where all drives are of one."""
+        of_any = self.config.model.vehicles == "any" and not self.config.vehicle
+        return self.driven if of_any else None
 
     def load(self, kinds: Sequence[Kind], split: Split) -> tuple[Drives, TerrainMap]:
         """Drives of these kinds in all folders, and of folders that are not divided into kinds."""
@@ -347,18 +350,18 @@ class _Pipeline:
             drives, terrain = dataset.load_drives(
                 folders(self.config, kinds), split, self.config.splits, wheels=False
             )
-            drives.expect_steered_by(vehicle.load(self.config.vehicle or vehicle.HMMWV))
+            drives.expect_steered_by(self.driven)
             self.loaded[key] = drives, terrain
         return self.loaded[key]
 
     def _sample(self, kinds: Sequence[Kind]) -> tuple[TerrainMap, Windows, Vehicle | None]:
         """Some windows of the training drives, as a measurement takes them, their ground, and the
-        vehicles of a model of many."""
+        vehicles that files describe."""
         recorded, terrain = self.load(kinds, "train")
         config = self.config.windows
         index = windows.index(recorded, terrain, config.context, config.horizon, config.stride)
         rows = np.linspace(0, len(index.drive) - 1, SAMPLE).astype(int)
-        vehicles = self._otherwise and recorded.driven(self._otherwise)
+        vehicles = described(recorded, self._otherwise)
         return terrain, windows.gather(recorded, index, rows), vehicles
 
 

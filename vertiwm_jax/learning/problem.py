@@ -15,7 +15,7 @@ from vertiwm_jax.learning import augment, windows
 from vertiwm_jax.learning.dataset import Drives
 from vertiwm_jax.learning.objectives import Objective, open_loop
 from vertiwm_jax.learning.windows import GROUNDS, WindowIndex, Windows
-from vertiwm_jax.mechanics.vehicle import Vehicle, VehicleConfig
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.terrain.map import TerrainMap
 
 
@@ -63,11 +63,11 @@ class WindowData:
         config: WindowConfig,
         training: tuple[Drives, TerrainMap],
         validation: tuple[Drives, TerrainMap],
-        otherwise: VehicleConfig | None = None,
+        otherwise: Vehicle | None = None,
     ) -> Self:
         """All windows of the training drives, and some of the validation drives.
 
-        otherwise: if drives are of many vehicles, the one where a file describes none.
+        otherwise: if vehicles are those that files describe, the one where a file describes none.
 
         Raises `DataError` when drives are too short, `MapError` when maps cannot be mirrored,
         `ConfigError` when no window has a chance to be drawn.
@@ -87,8 +87,8 @@ class WindowData:
             terrain=augment.with_mirrored(terrain) if config.mirror else terrain,
             validation=windows.gather(validation[0], held_out, rows),
             validation_terrain=validation[1],
-            vehicles=otherwise and drives.driven(otherwise),
-            validation_vehicles=otherwise and validation[0].driven(otherwise),
+            vehicles=described(drives, otherwise),
+            validation_vehicles=described(validation[0], otherwise),
         )
 
 
@@ -143,6 +143,13 @@ class WindowProblem:
         means = jnp.sum(kinds * error, axis=1) / jnp.sum(kinds, axis=1)
         by_kind = {f"error_{kind}": mean for kind, mean in zip(GROUNDS, means, strict=True)}
         return {**by_kind, "error": jnp.nanmean(means), "diverged": jnp.mean(lost)}
+
+
+def described(drives: Drives, otherwise: Vehicle | None) -> Vehicle | None:
+    """The vehicles by world, as `WindowData` has them; None where no file describes its own."""
+    if otherwise is None or not any(drives.described):
+        return None
+    return drives.driven(otherwise)
 
 
 def driven_in(params: Params, vehicles: Vehicle | None, world: jax.Array) -> Params:

@@ -110,6 +110,11 @@ class Vehicle:
         return self.wheel_position[0, 0] - self.wheel_position[2, 0]
 
     @property
+    def turn(self) -> Turn:
+        """What the second of its commands is."""
+        return "steering" if self.skid is None else "yaw_rate"
+
+    @property
     def track(self) -> jax.Array:
         """`[]` m between left and right wheels, the mean of both axles."""
         left, right = self.wheel_position[0::2, 1], self.wheel_position[1::2, 1]

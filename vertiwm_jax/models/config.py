@@ -1,15 +1,14 @@
 """Which world model: what it is made of, in a form that a file can hold."""
 
 from dataclasses import replace
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal
 
 import jax
 
 from vertiwm_jax.config import AtLeastOne, Count, settings
 from vertiwm_jax.mechanics.simulator import SimulatorParams
-from vertiwm_jax.networks.specialist import BASE, PAPER, NetworkSize, with_more_inputs
+from vertiwm_jax.networks.specialist import BASE, PAPER, NetworkSize
 from vertiwm_jax.perception.features import Encoders, init_pair, init_reduce, init_soil
-from vertiwm_jax.world_model import vehicle_features
 from vertiwm_jax.world_model.fusion import Coefficients, GateParams, GateTerrain
 from vertiwm_jax.world_model.nesam import Nesam
 from vertiwm_jax.world_model.normalization import Normalization
@@ -34,8 +33,9 @@ class ModelConfig:
     """What the Transformer is told of the ground; less than patches only to compare with."""
     soil: SoilSource = "map"
     """Whether NeSAM uses the soils of the map or predicts them from what the ground looks like."""
-    reads_vehicle: bool = False
-    """Whether specialists are told what the vehicle is, for a model of many vehicles."""
+    vehicles: Literal["one", "any"] = "one"
+    """Whether it is of the one vehicle that it is fitted to, or of any, by whose numbers NeSAM's
+    physics moves it; then it learns each drive with the vehicle that the file describes."""
     encoders: Literal["own", "shared"] = "own"
     """Own ones for each specialist, as in the paper, or one pair that both share: half the cost
     where both learn from the same ground."""
@@ -58,12 +58,12 @@ class ModelConfig:
     @property
     def transformer(self) -> Transformer:
         """The specialist for rigid ground."""
-        return Transformer(_SIZES[self.size], self.terrain, self.reads_vehicle)
+        return Transformer(_SIZES[self.size], self.terrain)
 
     @property
     def nesam(self) -> Nesam:
         """The specialist for soil."""
-        return Nesam(_SIZES[self.size], reads_vehicle=self.reads_vehicle)
+        return Nesam(_SIZES[self.size], any_vehicle=self.vehicles == "any")
 
     @property
     def verti_wm(self) -> VertiWM:
@@ -106,17 +106,6 @@ class ModelConfig:
             return params
         new = GateParams.untrained(key, self.gate_terrain, more)
         return replace(params, gate=params.gate.beside(new))
-
-    def reading_vehicles(self, params: VertiWMParams) -> tuple[Self, VertiWMParams]:
-        """The same for many vehicles, and parameters whose specialists ignore what they are told
-        of the vehicle, until they learn from it."""
-
-        def told(part: Any) -> Any:
-            more = vehicle_features.SIZE
-            return part and replace(part, network=with_more_inputs(part.network, more))
-
-        learned = replace(params, transformer=told(params.transformer), nesam=told(params.nesam))
-        return replace(self, reads_vehicle=True), learned
 
 
 def with_soil(params: VertiWMParams, soil: object) -> VertiWMParams:

@@ -47,7 +47,7 @@ def load_model(
     Args:
         name: which one.
         weights: folder of a fitted model; the one that comes with the package by default.
-        vehicle: which one it moves. By default simulator and bicycle move the HMMWV and learned
+        vehicle: which one it moves. By default simulator and bicycle move the HMMWV, and learned
             models the vehicle that they were fitted to; those of one vehicle move no other.
         soil: where NeSAM has soils from, if not from where it had them when it was fitted.
         embeddings: whether histories keep the latents that the Transformer sees, for a policy to
@@ -72,15 +72,15 @@ def load_model(
     if name not in found:
         raise CheckpointError(f"{folder}: expected {name}, found {' and '.join(found)} alone")
     dynamics, params = found[name]
-    if vehicle is not None and reads_vehicle(dynamics):
+    if vehicle is not None and moves_any(dynamics):
         params = moving(params, vehicle)
     return dynamics, cast_weights(params, compute_dtype)
 
 
-def reads_vehicle(dynamics: Dynamics) -> bool:
-    """Whether a learned model is of many vehicles, of which `moving` gives it one."""
+def moves_any(dynamics: Dynamics) -> bool:
+    """Whether a learned model is of any vehicle, which `moving` gives it."""
     part = getattr(dynamics, "nesam", None) or getattr(dynamics, "specialist", None)
-    return getattr(part, "reads_vehicle", False)
+    return getattr(part, "any_vehicle", False)
 
 
 def moving(params: VertiWMParams, vehicle: Vehicle) -> VertiWMParams:

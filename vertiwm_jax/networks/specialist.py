@@ -6,7 +6,6 @@ from typing import Any, Literal, TypeVar
 
 import flax.linen as nn
 import jax
-import jax.numpy as jnp
 from jax.tree_util import DictKey
 
 from vertiwm_jax.networks.transformer import Dense, KeyValueCache, Transformer
@@ -67,13 +66,6 @@ class SpecialistNetwork(nn.Module):
             token = token + self.embed_ground(ground)
         token, cache = self.transformer(token, cache)
         return self.head(token), cache
-
-
-def with_more_inputs(params: Any, count: int) -> Any:
-    """The parameters of a `SpecialistNetwork` that reads more of a step, and ignores it so far."""
-    embed = params["params"]["embed"]
-    kernel = jnp.pad(embed["kernel"], [(0, count), (0, 0)])
-    return {"params": {**params["params"], "embed": {**embed, "kernel": kernel}}}
 
 
 def cast_weights(params: P, dtype: ComputeDtype) -> P:

@@ -16,7 +16,7 @@ from vertiwm_jax.perception.features import TerrainFeatures
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model import motion, nesam_inputs, vehicle_features
+from vertiwm_jax.world_model import motion, nesam_inputs
 from vertiwm_jax.world_model.nesam_inputs import MOTION_SIGNS, StepFeatures
 from vertiwm_jax.world_model.normalization import Normalization
 
@@ -69,19 +69,19 @@ class Nesam:
     gradient: "exact" through the simulator; or "mean", several times cheaper, as if what it
         proposes depended on the velocities alone, and on them linearly (`NesamParams.response`).
         That is enough to fit models, but commands and soils have no gradient. Values are the same.
-    reads_vehicle: whether the network is told what the vehicle is; physics knows in any case.
+    any_vehicle: whether it has learned of many vehicles, each by its own physics, and so moves any.
     """
 
     size: NetworkSize = BASE
     gradient: Literal["exact", "mean"] = "mean"
     simulator: Simulator = Simulator()
-    reads_vehicle: bool = False
+    any_vehicle: bool = False
 
     def init_params(
         self, key: jax.Array, physics: SimulatorParams, normalization: Normalization | None = None
     ) -> NesamParams:
         """Physics as it is, and a network that leaves it so; its constants are still to measure."""
-        inputs = jnp.zeros(nesam_inputs.SIZE + self.reads_vehicle * vehicle_features.SIZE)
+        inputs = jnp.zeros(nesam_inputs.SIZE)
         return NesamParams(
             network=self.network.init(key, inputs, None, self.size.empty_cache()),
             contact=physics.contact,
@@ -117,11 +117,7 @@ class Nesam:
         step = StepFeatures.of(
             constants, scale, fixed, history.physics, state, command, physics, memory
         )
-        inputs = step.both
-        if self.reads_vehicle:
-            known = jnp.broadcast_to(vehicle_features.described(fixed), (2, vehicle_features.SIZE))
-            inputs = jnp.concatenate([inputs, known], axis=-1)
-        found: Any = self.network.apply(params.network, inputs, None, history.cache)
+        found: Any = self.network.apply(params.network, step.both, None, history.cache)
         outputs, cache = found
         correction = scale * (0.5 * (outputs[0] + MOTION_SIGNS * outputs[1]))
         return motion.corrected(physics, correction), NesamHistory(memory, cache, physics)

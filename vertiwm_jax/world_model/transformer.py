@@ -14,7 +14,7 @@ from vertiwm_jax.perception.features import CELLS, TerrainFeatures
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
-from vertiwm_jax.world_model import motion, vehicle_features
+from vertiwm_jax.world_model import motion
 from vertiwm_jax.world_model.normalization import INPUTS, Normalization
 
 Ground = Literal["patches", "indicator", "none"]
@@ -35,12 +35,10 @@ class Transformer:
 
     terrain: what it is told of the ground at the pose: encoded "patches"; the "indicator" of
         NRD (Zhang et al., 2026), 1 on soil and 0 on rigid ground; or "none".
-    reads_vehicle: whether it is told what the vehicle is.
     """
 
     size: NetworkSize = BASE
     terrain: Ground = "patches"
-    reads_vehicle: bool = False
 
     def init_params(
         self, key: jax.Array, normalization: Normalization | None = None
@@ -48,8 +46,7 @@ class Transformer:
         """Untrained weights; without constants, quantities are left in their units."""
         ground = {"patches": CELLS * self.size.channels, "indicator": 1, "none": 0}[self.terrain]
         seen = jnp.zeros(ground) if ground else None
-        inputs = jnp.zeros(INPUTS + self.reads_vehicle * vehicle_features.SIZE)
-        network = self.network.init(key, inputs, seen, self.size.empty_cache())
+        network = self.network.init(key, jnp.zeros(INPUTS), seen, self.size.empty_cache())
         return TransformerParams(network, normalization or Normalization.unit())
 
     def init(
@@ -71,8 +68,6 @@ class Transformer:
     ) -> tuple[VehicleState, KeyValueCache]:
         """The next state by the last 16 steps and what was seen in them (Eq. 2)."""
         inputs = params.normalization.inputs(state, command)
-        if self.reads_vehicle:
-            inputs = jnp.concatenate([inputs, vehicle_features.described(vehicle)])
         ground = self._ground(terrain, features, state)
         found: Any = self.network.apply(params.network, inputs, ground, history)
         outputs, cache = found
