@@ -180,13 +180,13 @@ class _Drive:
 
     def _described(self, where: Any) -> Any:
         """A vehicle by the numbers of its file."""
-        veh = self._veh
+        veh, before = self._veh, self._veh.GetDataPath()
         with TemporaryDirectory() as folder:
             chrono_vehicle.write(self._driven, Path(folder))
             veh.SetDataPath(f"{folder}/")
             car = veh.WheeledVehicle(self._system, f"{folder}/vehicle.json")
             car.Initialize(where)
-            car.GetChassis().SetFixed(False)
+            veh.SetDataPath(before)
         for corner in self._corners:
             car.GetWheel(*corner).GetTire().SetStepsize(self._step)
         locked = self._driven.locked
