@@ -23,11 +23,12 @@ from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.evaluation import prediction, yardsticks
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import schema
-from vertiwm_jax.learning.dataset import load_drives, load_file
+from vertiwm_jax.learning.dataset import load_drives
 from vertiwm_jax.learning.experiment import FitConfig, fit
 from vertiwm_jax.learning.identification import identify
 from vertiwm_jax.learning.pipeline import KINDS
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle, bicycle_of
+from vertiwm_jax.mechanics.measured import measured
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.models.config import ModelConfig
@@ -41,22 +42,17 @@ ALONE = 600
 
 def gather_logs(data: Path, vehicle: str, folder: Path) -> VehicleConfig:
     """Writes 60 s of world 0 of each kind to a folder; what its files say of the vehicle."""
-    described = None
+    ends = (0, TRAIN), (TRAIN, TRAIN + VALIDATION)
     for kind in KINDS:
         source = data / f"{vehicle}_{kind}_0.npz"
         arrays, meta = schema.read(source)
-        drives, _ = load_file(source)
-        (described,) = drives.described
-        assert described is not None, f"{source}: expected a description of the vehicle"
-        row = int(np.argmax(arrays["length"] >= TRAIN + VALIDATION))
+        row = np.flatnonzero(arrays["length"] >= TRAIN + VALIDATION)[0]
         state, control = arrays["state"][row], arrays["control"][row]
-        ends = (0, TRAIN), (TRAIN, TRAIN + VALIDATION)
         parts = [schema.drive(state[a : b + 1], control[a:b]) for a, b in ends]
         found = schema.join(parts) | {"split": np.array(["train", "validation"])}
-        wheels = described.vehicle.wheel_position
+        wheels = meta["vehicle"]["wheels_in_body_xy"]
         schema.write(folder / source.name, found, {"map": meta["map"]}, wheels)
-    assert described is not None
-    return described
+    return measured(meta["vehicle"], f"{source}: meta.vehicle")
 
 
 def models(options: Namespace, vehicle: str) -> Iterator[tuple[str, Dynamics, Params]]:
@@ -109,8 +105,11 @@ def predicted(options: Namespace, vehicle: str) -> Iterator[tuple[str, Figures]]
         whole = every["all", None]
         told = {"position_m": whole.position_m, "low_m": whole.position_m_low}
         told |= {"high_m": whole.position_m_high, "heading_rad": whole.heading_rad}
-        bins = {f"share of way, {b}": every["all", b].share_of_way for b in yardsticks.SPEEDS}
-        yield f"{vehicle}: {name}", told | {name: x for name, x in bins.items() if x is not None}
+        for speed in yardsticks.SPEEDS:
+            row = every.get(("all", speed))
+            if row is not None and row.share_of_way is not None:
+                told[f"share of way, {speed} m/s"] = row.share_of_way
+        yield f"{vehicle}: {name}", told
 
 
 def link(data: Path, names: list[str], folder: Path) -> Path:

@@ -110,7 +110,11 @@ def test_logs_are_imported_first_and_a_model_is_adapted_then(tmp_path, monkeypat
     argv = [str(log), "--output", str(output), "--free", "speed_gain", "--horizon", "4"]
     with pytest.raises(SystemExit, match=r"map: expected with settings"):
         cli.main("identify", [*argv, "--map", "map.npz"])
-    cli.main("identify", [*argv, "--settings", str(settings), "--model", "pretrained"])
+    asked = [*argv, "--settings", str(settings), "--model"]
+    with pytest.raises(SystemExit, match="none"):
+        cli.main("identify", [*asked, str(tmp_path / "none")])
+    assert not output.exists() and not output.with_suffix(".drives").exists()
+    cli.main("identify", [*asked, "pretrained"])
     (config,) = fitted
     assert config.data == (tmp_path / "my.drives",) and config.vehicle == str(output)
     assert config.model.vehicles == "any" and config.start.name == "pretrained"

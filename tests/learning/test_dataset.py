@@ -359,6 +359,8 @@ def test_worlds_that_are_left_out_are_only_to_test(tmp_path):
         split: [len(collection.rows(path, split)) for path in collection.lengths]
         for split in ("train", "validation", "test", "unseen", "all")
     }
+    pattern = Collection.of(folder, SplitConfig(leave_out=("rigid/rigid_*",)))
+    assert [len(pattern.rows(path, "unseen")) for path in pattern.lengths] == [0, 25, 25]
     # In the order other_012, rigid_012, rigid_013: only whole names of files and folders count.
     assert counts == {
         "train": [20, 0, 20],
@@ -400,9 +402,8 @@ def test_a_fit_leaves_the_unseen_worlds_out(tmp_path):
     (found,) = pipeline.expect_drives(config)
     assert found.left_out == {folder / "mixed_015.npz": "open/mixed/mixed_015"}
     for split, count in (("train", 20), ("validation", 2)):
-        loaded, terrain = pipeline._Pipeline(config, None, (), True, vehicle.load_vehicle()).load(
-            ("mixed",), split
-        )
+        shared = pipeline._Pipeline(config, None, (), True, vehicle.load_vehicle())
+        loaded, terrain = shared.load(("mixed",), split)
         assert len(loaded.state) == count and terrain.worlds == 1
     misspelt = SplitConfig(leave_out=("mixed/mixed_17",))
     with pytest.raises(DataError, match=r"leave_out: .* found mixed/mixed_17, which is not in"):

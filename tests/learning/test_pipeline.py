@@ -1,5 +1,7 @@
 """Whose physics is fitted; what is fitted, and in which order, is tested with the command."""
 
+from dataclasses import replace
+
 import chex
 import pytest
 from learning import recordings
@@ -32,6 +34,31 @@ def test_a_fit_that_goes_on_keeps_its_vehicle_unless_told(tmp_path, monkeypatch)
         chex.assert_trees_all_equal(fitted.nesam.network, start.nesam.network)
     # A stage of one is not taken over for the other.
     assert told[0] != told[1]
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "name", "expected"),
+    [("one", None, None), ("any", None, 2493.6), ("any", "rover", None)],
+)
+def test_a_model_of_any_vehicle_learns_by_the_vehicles_of_the_drives(
+    tmp_path, monkeypatch, vehicles, name, expected
+):
+    """Unless one is given; files that describe none are of the one that it goes on from."""
+    learned = []
+
+    def nothing_learned(run, stage, inputs, params, data, *_):
+        learned.append(data())
+        return params
+
+    monkeypatch.setattr(stages, "fit", nothing_learned)
+    recordings.write(tmp_path)
+    config = PipelineConfig(model=replace(NESAM, vehicles=vehicles), vehicle=name, data=(tmp_path,))
+    pipeline.fit(config, Run(tmp_path, None), files.load(files.PRETRAINED)[1])
+    (data,) = learned
+    for found in (data.vehicles, data.validation_vehicles):
+        assert (found is None) == (expected is None)
+        if found is not None:
+            assert found.mass.tolist() == pytest.approx([expected])
 
 
 def test_a_vehicle_that_is_none_is_named():

@@ -75,6 +75,8 @@ def test_it_drives_in_chrono_as_in_the_built_in_simulator(config):
     assert seen.state[78, 11] == pytest.approx(expected.state[78, 11], rel=0.25)
 
 
-def test_skid_steered_vehicles_are_refused():
+def test_what_chrono_cannot_drive_is_refused():
     with pytest.raises(SimulatorError, match="vehicle: expected one whose front wheels steer"):
         expect(load("husky"))
+    with pytest.raises(SimulatorError, match=r"less than its 3.5 kg, found wheel_weight 6 N"):
+        expect(replace(load("rover"), wheel_weight=6.0))

@@ -1,5 +1,7 @@
 """`vertiwm fit`: fit Verti-WM to recorded drives, all stages of it."""
 
+import shlex
+
 from vertiwm_jax import figures, runs
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.evaluation import plots
@@ -27,6 +29,6 @@ def run(name: str, words: list[str]) -> None:
     print(f"the model is in {folder / 'model'}; how well it predicts:")
     data, splits = pipeline.folders(config, pipeline.KINDS)[0], config.splits
     shared = f" --splits.shares {' '.join(map(str, splits.shares))} --splits.whole {splits.whole}"
-    shared += f" --splits.leave-out {' '.join(splits.leave_out)}"
+    shared += f" --splits.leave-out {shlex.join(splits.leave_out)}"
     also = "" if splits == FITTED else shared
     print(f"python -m vertiwm_jax.evaluate prediction --compare {folder} --data {data}{also}")

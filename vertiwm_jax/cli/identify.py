@@ -60,6 +60,10 @@ def run(name: str, words: list[str]) -> None:
             atomic.expect_file(path)
     if command.map is not None and command.settings is None:
         raise ConfigError("map: expected with settings, as drives have maps of their own")
+    adapt = configuration.load(FitConfig, configuration.find("adapt"))
+    if command.model is not None:  # That there is none is to be said now.
+        adapt = replace(adapt, start=command.model, runs=command.runs, splits=command.splits)
+        experiment.started(adapt)
     drives = command.drives
     if command.settings is not None:
         folder = command.output.with_suffix(".drives")
@@ -73,10 +77,7 @@ def run(name: str, words: list[str]) -> None:
     print("\n".join(_told(found)))
     model = "--model builtin"
     if command.model is not None:
-        adapt = configuration.load(FitConfig, configuration.find("adapt"))
-        changed = {"data": drives, "start": command.model, "runs": command.runs}
-        vehicle = str(command.output)
-        run = experiment.run(replace(adapt, splits=command.splits, vehicle=vehicle, **changed))
+        run = experiment.run(replace(adapt, data=drives, vehicle=str(command.output)))
         model = f"--weights {run / 'model'}"
     print(f"the vehicle is in {command.output}; to train with it:")
     print(f"python -m vertiwm_jax.ppo {model} --vehicle {command.output}")

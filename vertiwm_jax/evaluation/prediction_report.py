@@ -28,6 +28,7 @@ from vertiwm_jax.mechanics.kinematic import (
     differential_of,
 )
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.models.config import SoilSource
 from vertiwm_jax.models.registry import ModelName, load_fitted, load_model, moves_any, moving
 from vertiwm_jax.runs import Progress
@@ -104,25 +105,26 @@ class PredictionTest:
         if self.vehicle:
             drives = replace(drives, described=(None,) * terrain.worlds)
         driven = drives.driven(given)
-        known = bool(self.vehicle) or any(drives.described)
-        models: dict[str, tuple[Dynamics, Params | Partial]] = {}
+        models: dict[str, tuple[Dynamics, Params | Partial, Vehicle | None]] = {}
         for name, (dynamics, params) in learned.items():
-            if params.vehicle.turn == drives.turn:
-                own = known and moves_any(dynamics)
-                models[name] = dynamics, Partial(moving, params) if own else params
-            else:
+            if params.vehicle.turn != drives.turn:
                 _log.info("%s is left out: it drives a vehicle that is steered otherwise", name)
-        models["builtin"] = Simulator(), Partial(chrono_like)
+            elif moves_any(dynamics):
+                own = driven if self.vehicle else drives.driven(params.vehicle)
+                models[name] = dynamics, Partial(moving, params), own
+            else:
+                models[name] = dynamics, params, None
+        models["builtin"] = Simulator(), Partial(chrono_like), driven
         if driven.skid is None:
-            models["kinematic bicycle"] = KinematicBicycle(), Partial(bicycle_of)
+            models["kinematic bicycle"] = KinematicBicycle(), Partial(bicycle_of), driven
         else:
-            models["differential drive"] = DifferentialDrive(), Partial(differential_of)
-        models["constant velocity"] = ConstantVelocity(), None
+            models["differential drive"] = DifferentialDrive(), Partial(differential_of), driven
+        models["constant velocity"] = ConstantVelocity(), None, None
         every, tests = TestWindows.nested(drives, terrain, self.context, self.horizons, self.stride)
         predicted = {}
         with Progress(len(models), "models") as progress:
-            for name, model in models.items():
-                predicted[name] = prediction.predict(*model, every, driven)
+            for name, (dynamics, params, own) in models.items():
+                predicted[name] = prediction.predict(dynamics, params, every, own)
                 progress.advance(1, f"{name}, {len(every.drive):,} windows")
         found, tables = [], []
         for steps, (rows, test) in tests.items():

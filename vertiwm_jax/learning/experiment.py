@@ -49,7 +49,7 @@ def run(config: FitConfig) -> Path:
     """
     Run.expect(config, config.wandb)
     keep_compiled(config.compile_cache)
-    start = _start(config)
+    start = started(config)
     for collection in pipeline.expect_drives(config):
         _log.info("%s", collection)
     with Run.begin(config, config.name, project=config.wandb) as run:
@@ -97,7 +97,7 @@ def fit(
     return found.get("vertiwm") or next(iter(found.values()))
 
 
-def _start(config: FitConfig) -> VertiWMParams | None:
+def started(config: FitConfig) -> VertiWMParams | None:
     """The parameters to go on from; `ConfigError` if they are of another model."""
     if config.start is None:
         return None

@@ -21,7 +21,7 @@ from vertiwm_jax.learning.dataset import Collection, Drives, Split, SplitConfig
 from vertiwm_jax.learning.fitting import FitConfig, Problem
 from vertiwm_jax.learning.losses import LossConfig
 from vertiwm_jax.learning.objectives import RolloutLoss, TeacherForcingLoss
-from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem, described
+from vertiwm_jax.learning.problem import WindowConfig, WindowData, WindowProblem
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.learning.stages import Inputs
 from vertiwm_jax.learning.windows import Windows
@@ -207,8 +207,8 @@ class _Pipeline:
     """What the stages of a fit share.
 
     begun: what is known of the parameters that it begins with. driven: the vehicle of all drives,
-    or where files describe none. before: what the next stage builds
-    on, by the digests of earlier ones. loaded: drives that were read.
+    or where files describe none. before: what the next stage builds on, by the digests of earlier
+    ones. loaded: drives that were read.
     """
 
     config: PipelineConfig
@@ -361,7 +361,7 @@ class _Pipeline:
         config = self.config.windows
         index = windows.index(recorded, terrain, config.context, config.horizon, config.stride)
         rows = np.linspace(0, len(index.drive) - 1, SAMPLE).astype(int)
-        vehicles = described(recorded, self._otherwise)
+        vehicles = self._otherwise and recorded.driven(self._otherwise)
         return terrain, windows.gather(recorded, index, rows), vehicles
 
 

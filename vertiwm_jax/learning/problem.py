@@ -87,8 +87,8 @@ class WindowData:
             terrain=augment.with_mirrored(terrain) if config.mirror else terrain,
             validation=windows.gather(validation[0], held_out, rows),
             validation_terrain=validation[1],
-            vehicles=described(drives, otherwise),
-            validation_vehicles=described(validation[0], otherwise),
+            vehicles=otherwise and drives.driven(otherwise),
+            validation_vehicles=otherwise and validation[0].driven(otherwise),
         )
 
 
@@ -143,13 +143,6 @@ class WindowProblem:
         means = jnp.sum(kinds * error, axis=1) / jnp.sum(kinds, axis=1)
         by_kind = {f"error_{kind}": mean for kind, mean in zip(GROUNDS, means, strict=True)}
         return {**by_kind, "error": jnp.nanmean(means), "diverged": jnp.mean(lost)}
-
-
-def described(drives: Drives, otherwise: Vehicle | None) -> Vehicle | None:
-    """The vehicles by world, as `WindowData` has them; None where no file describes its own."""
-    if otherwise is None or not any(drives.described):
-        return None
-    return drives.driven(otherwise)
 
 
 def driven_in(params: Params, vehicles: Vehicle | None, world: jax.Array) -> Params:

@@ -60,8 +60,7 @@ def modules() -> tuple[Any, Any]:
 
 def expect(driven: VehicleConfig) -> None:
     """Raises `SimulatorError` where a vehicle cannot be driven in Chrono, or Chrono is missing."""
-    if driven.skid:
-        raise SimulatorError("vehicle: expected one whose front wheels steer, in Chrono")
+    chrono_vehicle.expect(driven)
     modules()
 
 
@@ -74,7 +73,7 @@ class Chrono:
     def __init__(self, terrain: TerrainMap, driven: VehicleConfig = _HMMWV) -> None:
         expect(driven)
         self._modules, self._terrain, self._ground = modules(), terrain, Ground(terrain)
-        self._driven = driven
+        self._driven, self._numbers = driven, driven.vehicle
         self._drive: _Drive | None = None
 
     def start(self, x: float, y: float, yaw: float) -> Observation:
@@ -90,7 +89,7 @@ class Chrono:
         """As `Simulator.step`."""
         assert self._drive, "expected start before step"
         speed, steering = map(float, command)
-        lock = float(self._driven.vehicle.steering_limit)
+        lock = float(self._numbers.steering_limit)
         self._drive.advance(speed, min(max(steering / lock, -1.0), 1.0))
         return self._observe(self._drive)
 
@@ -103,8 +102,7 @@ class Chrono:
         pose, twist, wheels, signals = drive.read()
         pose[:2] += self._ground.middle
         wheels[:, :2] += self._ground.middle
-        radius = self._driven.vehicle.wheel_radius
-        found = _observed(self._terrain, radius, pose, twist, wheels)
+        found = _observed(self._terrain, self._numbers.wheel_radius, pose, twist, wheels)
         state, kind, depth = jax.device_get(found)
         return Observation(state, kind, replace(signals, wheel_sinkage=depth))
 
@@ -119,7 +117,7 @@ def _observed(
     velocity = rotation.inverse() @ twist[:3]
     rpy = geometry.rpy_from_rotation(rotation)
     state = jnp.concatenate([pose[:3], rpy, velocity, twist[3:]])
-    return state, *under_wheels(terrain, wheels, jnp.asarray(radius))
+    return state, *under_wheels(terrain, wheels, radius)
 
 
 class _Drive:

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from vertiwm_jax.mechanics.vehicle import Vehicle, VehicleConfig, load
+from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, VehicleConfig, load
+from vertiwm_jax.simulators.protocol import SimulatorError
 
 Files = dict[str, dict[str, Any]]
-_HMMWV = load("hmmwv")
+_HMMWV = load(HMMWV)
 
 # Points of the reduced HMMWV, m from the middle of an axle; the y axis is to the left.
 _POINTS = {
@@ -51,8 +52,7 @@ _TORQUE = (
 _DRAG = ((-100, 0), (0, 0), (100, 0), (1000, -50), (2000, -70), (3000, -90))
 _GEARS = (0.1708, 0.2791, 0.4218, 0.6223, 1.0173, 1.5361)
 _REVERSE_GEAR, _FINAL_GEAR = -0.151, 0.2
-_MOST_TORQUE = 793 / _GEARS[0] / _FINAL_GEAR / 4  # N m at each of four wheels
-_REST_TORQUE = 382 / -_REVERSE_GEAR / _FINAL_GEAR / 4
+_REST_TORQUE = 382 / -_REVERSE_GEAR / _FINAL_GEAR / 4  # N m at each of four wheels, in reverse
 _CONTACT = {
     "Coefficient of Restitution": 0.1,
     "Properties": {"Young Modulus": 2e7, "Poisson Ratio": 0.3},
@@ -66,6 +66,18 @@ _CONTACT = {
 _CHASSIS_FRICTION = 0.4
 
 
+def expect(config: VehicleConfig) -> None:
+    """Raises `SimulatorError` unless a vehicle can be made of such parts."""
+    if config.skid:
+        raise SimulatorError("vehicle: expected one whose front wheels steer, in Chrono")
+    left = _chassis_mass(config.vehicle)
+    if left <= 0:
+        raise SimulatorError(
+            f"vehicle: expected, in Chrono, wheels with hubs of less than its {config.mass:g} kg, "
+            f"found wheel_weight {config.wheel_weight:g} N of each"
+        )
+
+
 def write(config: VehicleConfig, folder: Path) -> None:
     """Writes the JSON files that Chrono reads, of which `vehicle.json` names the others."""
     for name, content in files(config).items():
@@ -76,7 +88,7 @@ def files(config: VehicleConfig) -> Files:
     """What Chrono reads of a vehicle at full size with front wheels that steer, by file."""
     car, own = config.vehicle, _HMMWV.vehicle
     size = float(car.wheel_radius.mean() / own.wheel_radius.mean())
-    heavy = float(car.wheel_weight / own.wheel_weight)
+    heavy = _heavy(car)
     spin = float(car.wheel_inertia / own.wheel_inertia)
     made: Files = {"chassis": _chassis(car, heavy), "steering": _steering(car, size, heavy)}
     for axle, name in enumerate(("front", "rear")):
@@ -102,6 +114,16 @@ def files(config: VehicleConfig) -> Files:
     return made
 
 
+def _heavy(car: Vehicle) -> float:
+    """How heavy wheels, hubs and steering are, as a share of the HMMWV's."""
+    return float(car.wheel_weight / _HMMWV.vehicle.wheel_weight)
+
+
+def _chassis_mass(car: Vehicle) -> float:
+    """kg, without wheels, hubs and steering."""
+    return float(car.mass) - _heavy(car) * (4 * sum(_MASSES.values()) + _LINK)
+
+
 def _point(point: tuple[float, ...], size: float, wide: float) -> list[float]:
     """m: enlarged, sideways by another factor."""
     x, y, z = point
@@ -110,8 +132,7 @@ def _point(point: tuple[float, ...], size: float, wide: float) -> list[float]:
 
 def _chassis(car: Vehicle, heavy: float) -> dict[str, Any]:
     """What is left of mass and inertia without the wheels and the steering."""
-    corner = heavy * sum(_MASSES.values())
-    mass = float(car.mass) - 4 * corner - heavy * _LINK
+    corner, mass = heavy * sum(_MASSES.values()), _chassis_mass(car)
     middle = np.asarray(car.centre_of_mass, float) * float(car.mass) / mass
     away = np.column_stack([car.wheel_position, np.zeros(4)]) - car.centre_of_mass
     parts = [(corner, corner_away) for corner_away in away]
@@ -267,14 +288,13 @@ def _powertrain(config: VehicleConfig) -> Files:
 
 def _vehicle(config: VehicleConfig, size: float) -> dict[str, Any]:
     car = config.vehicle
-    middle = float(car.wheel_position[:, 0].mean())
     places = {"front": float(car.wheel_position[0, 0]), "rear": float(car.wheel_position[2, 0])}
     # The spindles lie a little before and behind the middles of their axles.
     places = {name: x - size * _POINTS[name]["spindle"][0] for name, x in places.items()}
     axles = [
         {
             "Suspension Input File": f"{name}.json",
-            "Suspension Location": [float(x - middle), 0, float(size * _HEIGHT)],
+            "Suspension Location": [float(x), 0, float(size * _HEIGHT)],
             "Left Wheel Input File": "wheel.json",
             "Right Wheel Input File": "wheel.json",
             "Left Brake Input File": "brake.json",
@@ -284,7 +304,7 @@ def _vehicle(config: VehicleConfig, size: float) -> dict[str, Any]:
         for name, x in places.items()
     ]
     behind, above = _RACK
-    rack = [float(places["front"] - middle - size * behind), 0, float(size * above)]
+    rack = [float(places["front"] - size * behind), 0, float(size * above)]
     driven = {"all": [0, 1], "front": [0], "rear": [1]}[config.drive]
     return {
         "Type": "Vehicle",
