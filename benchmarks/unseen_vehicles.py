@@ -1,6 +1,6 @@
 """How well vehicles are predicted that no fit has learned from, by what is known of them.
 
-`python -m benchmarks.unseen_vehicles data/wide --model runs/any_vehicle.../model --vehicles uaz`
+`python -m benchmarks.unseen_vehicles data/vehicles --model runs/any_vehicle.../model --vehicles uaz`
 reads files `<vehicle>_<kind>_<0 or 1>.npz`. World 1 of each kind is predicted: by the model of any
 vehicle with nothing but what the file says of the vehicle; after it was adapted to 60 s of world
 0; and by what is fitted to these 60 s alone. `--whole` adds a default fit to all of world 0.

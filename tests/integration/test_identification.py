@@ -14,6 +14,7 @@ from vertiwm_jax.config import ConfigError
 from vertiwm_jax.learning import experiment
 from vertiwm_jax.learning.dataset import load_drives
 from vertiwm_jax.learning.identification import MASS, NINETY
+from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
@@ -88,6 +89,25 @@ def test_a_delay_is_found(drives, tmp_path):
     delay, low, high = vw.identify(late, free=("speed_gain",), horizon=8).delay
     assert low < delay < high
     assert delay == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_stuck_vehicle_tells_nothing(drives, tmp_path):
+    """It stands, whatever it is told, as one does that hangs on a rock."""
+    stuck = tmp_path / "stuck"
+    shutil.copytree(drives, stuck)
+    with np.load(drives / "drives.npz") as recorded:
+        arrays = dict(recorded, split=np.full(8, "train"))
+    np.savez(stuck / "drives.npz", **arrays)
+    alone = vw.identify(stuck, free=("speed_gain",), horizon=8).vehicle
+    np.savez(stuck / "moving.npz", **arrays)
+    arrays["state"][:] = arrays["state"][:, :1] * np.repeat([1, 1, 0, 0], 3)
+    np.savez(stuck / "drives.npz", **arrays)
+    np.savez(stuck / "more.npz", **arrays)
+    beside = vw.identify(stuck, free=("speed_gain",), horizon=8).vehicle
+    assert beside.speed_gain == pytest.approx(alone.speed_gain, rel=1e-3)
+    (stuck / "moving.npz").unlink()
+    with pytest.raises(DataError, match="expected drives in which the vehicle moves"):
+        vw.identify(stuck, free=("speed_gain",), horizon=8)
 
 
 def test_logs_are_imported_first_and_a_model_is_adapted_then(tmp_path, monkeypatch, capsys):

@@ -121,7 +121,7 @@ class SplitConfig:
     """What is never divided: drives, or all drives on the same map."""
     leave_out: tuple[str, ...] = ()
     """Worlds of which no drive is to train or for validation, whatever files say: ends of the paths
-    of their files, without `.npz`; `wide/uaz_*` are all that begin so."""
+    of their files, without `.npz`; `vehicles/uaz_*` are all that begin so."""
 
     def check(self):
         if abs(sum(self.shares) - 1) > 1e-6:

@@ -21,6 +21,7 @@ from vertiwm_jax.importers.delay import Response
 from vertiwm_jax.learning import windows
 from vertiwm_jax.learning.dataset import FITTED, Drives, SplitConfig, load_drives
 from vertiwm_jax.learning.objectives import open_loop
+from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.mechanics import vehicle as vehicles
 from vertiwm_jax.mechanics.simulator import Simulator, SimulatorParams, chrono_like
@@ -58,6 +59,7 @@ NINETY = 1.645
 _NOISE = (0.005, 0.002, 0.01, 0.01)  # m, rad, m/s and rad/s that recorded states may be off
 _DRAWS = 6  # of such noise
 _SURE = 0.06  # standard deviation of a logarithm that is left however many drives there are
+_STUCK = 0.1  # share of the commanded way, below which a vehicle is stuck
 _FLOOR = 1e-3  # m, below which no miss is told from another
 Misses = Callable[[np.ndarray], np.ndarray]
 _log = logging.getLogger(__name__)
@@ -114,10 +116,11 @@ def identify(
     """Finds numbers of a vehicle with which the simulator predicts its drives best.
 
     Each number is multiplied by a factor near 1 (`PRIORS`), which nonlinear least squares find.
-    Windows with a crash count little, and what drives tell nothing of stays as it is. Intervals
-    hold if the simulator can be right: what it lacks, other numbers make up for. Poses and commands
-    tell forces and moments of inertia only beside the mass, which is taken as given. The delay
-    after which commands act is found too, from the estimate of `importers.delay` on.
+    Windows with a crash count little, those of a stuck vehicle do not, and what drives tell nothing
+    of stays as it is. Intervals hold if the simulator can be right: what it lacks, other numbers
+    make up for. Poses and commands tell forces and moments of inertia only beside the mass, which
+    is taken as given. The delay after which commands act is found too, from the estimate of
+    `importers.delay` on.
 
     Args:
         drives: a folder of drives, as `load_drives` reads them, or several.
@@ -132,7 +135,8 @@ def identify(
 
     Raises:
         ConfigError: there is no such vehicle or field.
-        DataError, MapError: drives or their maps are malformed, or all drives are too short.
+        DataError, MapError: drives or their maps are malformed, or all drives are too short, or the
+            vehicle is stuck in all of them.
     """
     begin = vehicles.load(vehicle) if isinstance(vehicle, str) else vehicle
     configuration.expect_fields(free, VehicleConfig, where="free: ")
@@ -145,8 +149,11 @@ def identify(
     recorded.expect_steered_by(begin)
     context = min(_CONTEXT, max(int(np.max(recorded.length)) - horizon, 0))
     index = windows.index(recorded, terrain, context, horizon, horizon)
-    every = -(-len(index.start) // _MOST_WINDOWS)
-    chosen = windows.gather(recorded, index, np.arange(0, len(index.start), every))
+    rows = np.flatnonzero(_moves(windows.gather(recorded, index)))
+    if not len(rows):
+        raise DataError(f"{drives}: expected drives in which the vehicle moves, found none")
+    rows = rows[:: -(-len(rows) // _MOST_WINDOWS)]
+    chosen = windows.gather(recorded, index, rows)
     late = _estimated_delay(recorded)
     deviation = np.array([PRIORS.get(name, _OTHERS) for name in free])
 
@@ -182,6 +189,16 @@ def identify(
     return Identified(changed(factors), tuple(told), (found, low, high), before, after)
 
 
+def _moves(of: Windows) -> np.ndarray:
+    """`[N]` in which windows the vehicle moves, or is to stand.
+
+    One that is stuck tells what it hangs on, and not what it is.
+    """
+    state, speed = np.asarray(of.state)[:, of.context :], np.asarray(of.control)[:, of.context :, 0]
+    way = np.linalg.norm(np.diff(state[..., :3], axis=1), axis=-1).sum(axis=1)
+    return way >= _STUCK * np.abs(speed).sum(axis=1) * STEP_SECONDS
+
+
 def _estimated_delay(drives: Drives) -> float:
     """How late the vehicle of drives acts on its commands, s; 0 if they do not tell."""
     responses = []
@@ -214,7 +231,7 @@ def _posterior(misses: Misses, blur: Misses, numbers: int) -> tuple[np.ndarray, 
     for _ in range(_ROUNDS):
         missed = misses(found)
         scale = blur(found) + _FLOOR
-        scale = scale * 1.4826 * np.median(np.abs(missed / scale))
+        scale = scale * max(1.4826 * np.median(np.abs(missed / scale)), _FLOOR)
         typical = np.mean((missed / scale) ** 2, axis=1)
         # All misses of a window count as one: they hang together.
         weight = 1 / np.sqrt(missed.shape[1] * (1 + typical / _CRASH**2))[:, None] / scale
