@@ -1,9 +1,9 @@
 """How well vehicles are predicted that no fit has learned from, by what is known of them.
 
-`python -m benchmarks.unseen_vehicles data/vehicles --model runs/any_vehicle.../model --vehicles uaz`
-reads files `<vehicle>_<kind>_<0 or 1>.npz`. World 1 of each kind is predicted: by the model of any
-vehicle with nothing but what the file says of the vehicle; after it was adapted to 60 s of world
-0; and by what is fitted to these 60 s alone. `--whole` adds a default fit to all of world 0.
+`python -m benchmarks.unseen_vehicles data/vehicles --vehicles uaz` reads the files
+`<vehicle>_<kind>_<0 or 1>.npz`. World 1 of each kind is predicted: by the model of any vehicle with
+nothing but what the file says of the vehicle; after it was adapted to 60 s of world 0; and by what
+is fitted to these 60 s alone. `--whole` adds a default fit to all of world 0.
 """
 
 import logging
@@ -124,7 +124,7 @@ def link(data: Path, names: list[str], folder: Path) -> Path:
 def main() -> None:
     options = parser(__doc__)
     options.add_argument("data", type=Path)
-    options.add_argument("--model", type=Path, required=True, help="of any vehicle")
+    options.add_argument("--model", default="any_vehicle", help="folder of a model of any vehicle")
     options.add_argument("--vehicles", nargs="+", default=["fam_006", "fam_009", "uaz"])
     options.add_argument("--whole", action="store_true")
     options.add_argument("--runs", type=Path, default=Path("runs/unseen_vehicles"))

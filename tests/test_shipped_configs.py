@@ -27,11 +27,14 @@ def test_every_one_can_be_read(file):
     assert kind or loaded.name in file.stem
 
 
-@pytest.mark.parametrize("name", ["fine_tune", "gates"])
-def test_what_goes_on_from_the_model_that_comes_along_is_of_its_form(name):
+@pytest.mark.parametrize(
+    ("name", "start"),
+    [("fine_tune", "pretrained"), ("gates", "pretrained"), ("adapt", "any_vehicle")],
+)
+def test_what_goes_on_from_a_model_that_comes_along_is_of_its_form(name, start):
     settings = config.load(FitConfig, FOLDER / f"{name}.yaml")
-    assert settings.start == Path("pretrained")
-    assert settings.model == files.load(files.PRETRAINED)[0]
+    assert settings.start == Path(start)
+    assert settings.model == files.load(files.find(start))[0]
 
 
 @pytest.mark.parametrize("name", experiment.TRAININGS)

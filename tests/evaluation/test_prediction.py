@@ -287,7 +287,6 @@ def test_predictions_are_of_the_selected_worlds():
     assert float(final.rpy[1, -1, 1]) == pytest.approx(-np.arctan(0.2), abs=1e-4)
 
 
-@pytest.mark.integration
 def untrained():
     """NeSAM, which has learned nothing beside physics."""
     config = ModelConfig(parts=("nesam",), terrain="none", vehicles="any")
@@ -296,6 +295,7 @@ def untrained():
     return model, Partial(moving, with_soil(model.part_of(params), None))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("model", [lambda: (Simulator(), Partial(chrono_like)), untrained])
 def test_every_world_is_predicted_with_its_own_vehicle(model):
     """Two vehicles accelerate and turn on worlds of their own; each is its own best model."""

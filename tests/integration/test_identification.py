@@ -137,7 +137,7 @@ def test_logs_are_imported_first_and_a_model_is_adapted_then(tmp_path, monkeypat
     cli.main("identify", [*asked, "pretrained"])
     (config,) = fitted
     assert config.data == (tmp_path / "my.drives",) and config.vehicle == str(output)
-    assert config.model.vehicles == "any" and config.start.name == "pretrained"
+    assert config.model.vehicles == "any" and config.start.name == "any_vehicle"
     assert len(load_drives(config.data, "all")[0].length) == 1
     assert f"--weights {tmp_path / 'run' / 'model'}" in capsys.readouterr().out
 

@@ -381,7 +381,7 @@ def test_the_unseen_worlds_are_four_of_each_kind_from_low_to_high(monkeypatch):
     monkeypatch.chdir(OPEN)  # However the folder is named, the worlds are found.
     found = [Collection.of(kind, dataset.FITTED) for kind in KINDS]
     names = [name for collection in found for name in collection.left_out.values()]
-    assert sorted(names) == sorted(dataset.UNSEEN)
+    assert sorted(names) == sorted(x for x in dataset.UNSEEN if x.startswith("open"))
     for collection in found:
         steep = []
         for path in collection.left_out:

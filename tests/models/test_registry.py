@@ -16,7 +16,7 @@ from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import load, load_vehicle
 from vertiwm_jax.models import files
 from vertiwm_jax.models.config import ModelConfig, with_soil
-from vertiwm_jax.models.registry import load_fitted, load_model
+from vertiwm_jax.models.registry import load_encoders, load_fitted, load_model, moves_any
 from vertiwm_jax.networks.specialist import cast_weights
 from vertiwm_jax.world_model.nesam import Nesam
 
@@ -60,6 +60,19 @@ def test_a_model_of_any_vehicle_moves_the_one_that_is_asked_for(tmp_path, vehicl
     _, asked = load_model("nesam", tmp_path, vehicle=rover)
     chex.assert_trees_all_equal(own.vehicle, load_vehicle())
     chex.assert_trees_all_equal(asked.vehicle, rover if vehicles == "any" else load_vehicle())
+
+
+def test_every_vehicle_but_the_hmmwv_has_the_shipped_model_of_any():
+    hmmwv, rover, husky = (load(name).vehicle for name in ("hmmwv", "rover", "husky"))
+    for asked, any_vehicle in ((None, False), (hmmwv, False), (rover, True)):
+        model, params = load_model("nesam", vehicle=asked)
+        assert moves_any(model) == any_vehicle
+        chex.assert_trees_all_equal(params.vehicle, asked or hmmwv)
+    model, params = load_model("nesam", "any_vehicle")
+    assert moves_any(model) and params.vehicle.mass == hmmwv.mass
+    chex.assert_trees_all_equal(load_encoders("any_vehicle"), load_encoders())
+    with pytest.raises(CheckpointError, match="whose front wheels steer, found one that is skid"):
+        load_model("nesam", vehicle=husky)
 
 
 def test_embeddings_are_kept_where_they_are_asked_for():

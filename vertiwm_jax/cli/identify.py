@@ -46,7 +46,7 @@ class Identify:
     """How drives are shared out whose files do not say what they are for; those to train are used,
     and to adapt also those for validation."""
     model: Path | None = None
-    """Folder of a model, or `pretrained`, to adapt to the vehicle by `configs/adapt.yaml`."""
+    """Folder of a model, or `any_vehicle`, to adapt to the vehicle by `configs/adapt.yaml`."""
     runs: Path = Path("runs")
     """Folder in which the folder of the adapted model is made."""
     picture: Path | None = None

@@ -29,7 +29,7 @@ class View:
     model: ModelName = "vertiwm"
     """What a policy drives in, or whose predictions are shown beside a recorded drive."""
     weights: Path | None = None
-    """Folder of a fitted model, instead of the one that comes with the package."""
+    """Folder of a fitted model, instead of one that comes with the package."""
     vehicle: str | None = None
     """Name or YAML file of the vehicle; by default that of the policy's training, or the HMMWV."""
     suite: Suite | None = None

@@ -374,7 +374,7 @@ def make_env(
         model: what moves the vehicle, see `load_model`.
         vehicle: a vehicle, the name of a shipped one, or a YAML file of one; learned models
             move the one that they were fitted to.
-        weights: folder of a fitted model; the shipped one by default.
+        weights: folder of a fitted model; a shipped one by default, as `load_model` says.
         config: what the task asks.
         pairs: tasks in a world, each from one point of a circle to the opposite one.
         seed: draws the default worlds.

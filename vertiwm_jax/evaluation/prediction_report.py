@@ -57,7 +57,8 @@ class PredictionTest:
     models: Models = ("vertiwm", "nesam", "transformer")
     """The models."""
     weights: Path | None = None
-    """Folder of a fitted model, instead of the one that comes with the package."""
+    """Folder of a fitted model, or the name of one that comes with the package, `pretrained` or
+    `any_vehicle`. By default the first where the HMMWV drives, and the second elsewhere."""
     vehicle: str | None = None
     """What the built-in simulator, the bicycle and learned models of any vehicle drive: the name
     of a shipped vehicle, or a YAML file of one. By default the vehicle that each file of drives
@@ -93,18 +94,20 @@ class PredictionTest:
             _log.info("%s; predicted: %s", collection, split)
         dataset.expect_drives(collections, split, self.context + max(self.horizons))
         given = vehicle.load(self.vehicle or vehicle.HMMWV).vehicle
+        drives, terrain = dataset.load_drives(self.data, split, self.splits)
+        if self.vehicle:
+            drives = replace(drives, described=(None,) * terrain.worlds)
+        driven = drives.driven(given)
+        of_any = any(drives.described) or not vehicle.equal(given, vehicle.load_vehicle())
+        weights = self.weights or ("any_vehicle" if of_any else "pretrained")
         learned: dict[str, tuple[Dynamics, Params]] = {
-            name: load_model(name, self.weights, soil=self.soil)
+            name: load_model(name, weights, soil=self.soil)
             for name in self.models
             if name != "builtin"
         }
         for folder in self.compare:
             fitted = load_fitted(folder / "model")
             learned |= {f"{folder.name}: {part}": model for part, model in fitted.items()}
-        drives, terrain = dataset.load_drives(self.data, split, self.splits)
-        if self.vehicle:
-            drives = replace(drives, described=(None,) * terrain.worlds)
-        driven = drives.driven(given)
         models: dict[str, tuple[Dynamics, Params | Partial, Vehicle | None]] = {}
         for name, (dynamics, params) in learned.items():
             if params.vehicle.turn != drives.turn:

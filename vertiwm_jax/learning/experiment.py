@@ -32,9 +32,10 @@ class FitConfig(PipelineConfig):
     resume: Path | None = None
     """Folder of an earlier run to go on with; stages that have ended are not repeated."""
     start: Path | None = None
-    """Folder of a fitted model to go on from, or `pretrained`: it is fitted further by open-loop
-    predictions; its encoders and constants stay. It may have fewer gates than `model.gates`,
-    and be of one vehicle where `model.vehicles` is any."""
+    """Folder of a fitted model to go on from, or the name of one that comes with the package,
+    `pretrained` or `any_vehicle`: it is fitted further by open-loop predictions; its encoders and
+    constants stay. It may have fewer gates than `model.gates`, and be of one vehicle where
+    `model.vehicles` is any."""
     wandb: str | None = None
     """Project of Weights & Biases that gets the metrics too; needs the package `wandb`."""
     compile_cache: Path | None = None
@@ -76,8 +77,8 @@ def fit(
         drives: a folder of drives, as `load_drives` reads them, or several.
         config: name of shipped settings (`fit_chrono` for a new model, `fine_tune` to go
             on from the pretrained one, ...), or a YAML file of them.
-        start: folder of a fitted model to go on from, or `pretrained`; by default what the settings
-            say.
+        start: folder of a fitted model to go on from, or the name of one that comes with the
+            package, `pretrained` or `any_vehicle`; by default what the settings say.
         runs: folder in which the folder of this run is made.
         settings: fields of the settings to change (`seed`, `vehicle`, `model`, ...).
 
@@ -101,8 +102,7 @@ def started(config: FitConfig) -> VertiWMParams | None:
     """The parameters to go on from; `ConfigError` if they are of another model."""
     if config.start is None:
         return None
-    pretrained = config.start == Path("pretrained")
-    found, params = files.load(files.PRETRAINED if pretrained else config.start)
+    found, params = files.load(files.find(config.start))
     if config.model.vehicles == "any":
         found = replace(found, vehicles="any")
     if found.gates > config.model.gates or replace(found, gates=config.model.gates) != config.model:

@@ -295,6 +295,13 @@ class VehicleConfig:
         return jax.tree.map(lambda x: np.asarray(x, np.float32), large)
 
 
+def equal(first: Vehicle, second: Vehicle) -> bool:
+    """Whether two vehicles have the same numbers."""
+    if jax.tree.structure(first) != jax.tree.structure(second):
+        return False
+    return jax.tree.all(jax.tree.map(np.array_equal, first, second))
+
+
 def stack(vehicles: Sequence[Vehicle]) -> Vehicle:
     """Vehicles of any layouts as one with leaves `[N, ...]`, for `select`.
 

@@ -7,14 +7,29 @@ import jax
 
 from vertiwm_jax import checkpoints
 from vertiwm_jax import config as configuration
+from vertiwm_jax.mechanics import vehicle as vehicles
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
 from vertiwm_jax.models.config import ModelConfig
 from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
-PRETRAINED = Path(__file__).parents[1] / "weights"
-"""Folder of the model that comes with the package; its model card is `docs/model_card.md`."""
+_SHIPPED = Path(__file__).parents[1] / "weights"
+PRETRAINED, ANY_VEHICLE = _SHIPPED / "pretrained", _SHIPPED / "any_vehicle"
+"""Folders of the models that come with the package, of the HMMWV and of any vehicle whose front
+wheels steer; `docs/model_card.md` describes them."""
 _CONFIG = "model.yaml"
+
+
+def find(folder: str | Path) -> Path:
+    """The folder of a model, which may be the name of one that comes with the package."""
+    shipped = {path.name: path for path in (PRETRAINED, ANY_VEHICLE)}
+    return shipped.get(str(folder), Path(folder))
+
+
+def shipped(vehicle: Vehicle | None = None) -> Path:
+    """The folder of the model that comes with the package for a vehicle, the HMMWV by default."""
+    known = vehicle is None or vehicles.equal(vehicle, load_vehicle())
+    return PRETRAINED if known else ANY_VEHICLE
 
 
 def save(folder: Path, config: ModelConfig, params: VertiWMParams) -> None:

@@ -46,7 +46,9 @@ def load_model(
 
     Args:
         name: which one.
-        weights: folder of a fitted model; the one that comes with the package by default.
+        weights: folder of a fitted model, or the name of one that comes with the package:
+            `pretrained`, the HMMWV's, or `any_vehicle`. By default the first for the HMMWV, and the
+            second for every other vehicle.
         vehicle: which one it moves. By default simulator and bicycle move the HMMWV, and learned
             models the vehicle that they were fitted to; those of one vehicle move no other.
         soil: where NeSAM has soils from, if not from where it had them when it was fitted.
@@ -58,7 +60,8 @@ def load_model(
             whole (`Nesam.gradient`), which is several times cheaper.
 
     Raises:
-        CheckpointError, ConfigError: as `files.load`, and when the folder holds other parts alone.
+        CheckpointError, ConfigError: as `files.load`, and when the folder holds other parts alone,
+            or a model of vehicles that are steered otherwise.
     """
     if name == "builtin":
         return Simulator(), chrono_like(vehicle or load_vehicle())
@@ -67,12 +70,18 @@ def load_model(
         if driven.skid is not None:
             return DifferentialDrive(), differential_of(driven)
         return KinematicBicycle(), bicycle_of(driven)
-    folder = Path(weights or files.PRETRAINED)
+    folder = files.find(weights) if weights else files.shipped(vehicle)
     found = load_fitted(folder, soil, embeddings, exact_gradient)
     if name not in found:
         raise CheckpointError(f"{folder}: expected {name}, found {' and '.join(found)} alone")
     dynamics, params = found[name]
     if vehicle is not None and moves_any(dynamics):
+        if vehicle.turn != params.vehicle.turn:
+            kinds = {"steering": "whose front wheels steer", "yaw_rate": "that is skid-steered"}
+            raise CheckpointError(
+                f"{folder}: expected a vehicle {kinds[params.vehicle.turn]}, found one "
+                f"{kinds[vehicle.turn]}; fit a model to its drives"
+            )
         params = moving(params, vehicle)
     return dynamics, cast_weights(params, compute_dtype)
 
@@ -115,9 +124,11 @@ def load_fitted(
 def load_encoders(weights: str | Path | None = None) -> Encoders:
     """The Transformer's encoders, by which policies see the ground in whatever they drive.
 
+    Both models that come with the package have the same.
+
     Raises like `load_model`, with "transformer".
     """
-    folder = Path(weights or files.PRETRAINED)
+    folder = files.find(weights or files.PRETRAINED)
     config, params = files.load(folder)
     if "transformer" not in config.parts or config.terrain != "patches":
         raise CheckpointError(

@@ -21,6 +21,7 @@ from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, VehicleConfig
+from vertiwm_jax.models import files
 from vertiwm_jax.models.registry import Imagined, ModelName, load_encoders, load_model
 from vertiwm_jax.networks.specialist import ComputeDtype
 from vertiwm_jax.perception.features import Encoders
@@ -53,8 +54,8 @@ class TaskConfig:
     seed: CountOrZero = 0
     """Decides everything that is random."""
     vehicle: str = HMMWV
-    """What the built-in simulator drives: the name of a shipped vehicle, or a YAML file of
-    one; other models drive what they were fitted to."""
+    """What drives: the name of a shipped vehicle, or a YAML file of one. Models that were fitted
+    to one vehicle drive that."""
     terrain: Path | None = None
     """A Verti-Bench checkout or a folder of .npz maps; procedural worlds by default."""
     ground: GroundConfig = GroundConfig()
@@ -66,7 +67,8 @@ class TaskConfig:
     model: ModelName = "vertiwm"
     """What moves the vehicle while learning; tests after it are in the built-in simulator."""
     weights: Path | None = None
-    """Folder of a fitted model, instead of the one that comes with the package."""
+    """Folder of a fitted model, instead of one that comes with the package, of which the HMMWV has
+    its own; or the name of that, `pretrained` or `any_vehicle`."""
     compute_dtype: ComputeDtype | Literal["auto"] = "auto"
     """Precision in which learned models multiply large matrices. bfloat16 is faster on CPUs with
     AVX512_BF16 and slower on others; prediction errors change by less than 1 %. A training that
@@ -292,7 +294,8 @@ def run(
     Run.expect(config, config.wandb)
     keep_compiled(config.compile_cache)
     # So that it goes on as it began, and is tested, from wherever that is.
-    paths = {name: getattr(config, name) for name in ("terrain", "weights")}
+    weights = config.weights and files.find(config.weights)
+    paths = {"terrain": config.terrain, "weights": weights}
     absolute = {name: path and path.absolute() for name, path in paths.items()}
     config = replace(config, compute_dtype=config.fixed_dtype, **absolute)
     moves, weights = dynamics(config, config.model)
