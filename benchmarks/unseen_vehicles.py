@@ -32,7 +32,7 @@ from vertiwm_jax.mechanics.measured import measured
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import VehicleConfig
 from vertiwm_jax.models.config import ModelConfig
-from vertiwm_jax.models.registry import load_model
+from vertiwm_jax.models.registry import load_model, moving
 
 TRAIN, VALIDATION = 150, 50
 """Steps of each of three drives, one on each kind of ground: 60 s."""
@@ -66,13 +66,13 @@ def models(options: Namespace, vehicle: str) -> Iterator[tuple[str, Dynamics, Pa
         yield f"{name}, described", *load_model(name, options.model, vehicle=described.vehicle)
 
     identified = identify(logs, described).vehicle
-    file = folder / "identified.yaml"
-    file.write_text(configuration.dump(identified))
     yield "simulator, identified", Simulator(), chrono_like(identified.vehicle)
-    yield (
-        "vertiwm, identified",
-        *load_model("vertiwm", options.model, vehicle=identified.vehicle),
-    )
+    model, params = load_model("vertiwm", options.model)
+    before, after = (moving(params, each.vehicle) for each in (described, identified))
+    yield "vertiwm, identified", model, after
+    gained = prediction.gain(model, before, after, *load_drives(logs, "train", wheels=False))
+    file = folder / "vehicle.yaml"
+    file.write_text(configuration.dump(identified if gained.low > 0 else described))
     given: dict[str, Any] = {"vehicle": str(file), "runs": folder}
     yield "vertiwm, adapted", *fit(logs, config="adapt", start=options.model, **given)
     yield "NeSAM, of 60 s alone", *fit(logs, **alone(), **given)

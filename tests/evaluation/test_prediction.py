@@ -227,6 +227,26 @@ def test_windows_of_a_horizon_are_those_of_this_horizon_alone():
         TestWindows.nested(drives, GROUND, CONTEXT, (3, 21), 2)
 
 
+@dataclass(frozen=True)
+class Climbing:
+    """Constant velocity, and a climb of as many m a step as its parameters say."""
+
+    def init(self, params, terrain, state):
+        return ()
+
+    def step(self, params, terrain, history, state, command):
+        after, _ = ConstantVelocity().step(None, terrain, (), state, command)
+        return replace(after, position=after.position + jnp.array([0, 0, params])), ()
+
+
+def test_the_gain_by_other_parameters_is_what_they_err_less():
+    drives = drives_of([40, 50, 60])
+    worse, better = (jnp.float32(x) for x in (0.02, 0.01))
+    found = prediction.gain(Climbing(), worse, better, drives, GROUND)
+    assert (found.mean, found.low, found.high) == pytest.approx([0.16] * 3, rel=1e-3)
+    assert prediction.gain(Climbing(), better, worse, drives, GROUND).high < 0
+
+
 def test_error_is_found_where_it_is():
     semantic = np.full((16, 16), 3)
     semantic[:, 8:] = terrain_map.STANDARD.names.index("mud")  # east of x = 0

@@ -11,14 +11,16 @@ from vertiwm_jax import atomic, figures
 from vertiwm_jax import config as configuration
 from vertiwm_jax.cli import arguments
 from vertiwm_jax.config import AtLeastOne, ConfigError, Count, settings
-from vertiwm_jax.evaluation import plots
+from vertiwm_jax.evaluation import plots, prediction
 from vertiwm_jax.evaluation.tables import Row, markdown
 from vertiwm_jax.importers.imports import import_drives
 from vertiwm_jax.learning import experiment, identification
-from vertiwm_jax.learning.dataset import FITTED, SplitConfig
+from vertiwm_jax.learning.dataset import FITTED, SplitConfig, load_drives
 from vertiwm_jax.learning.experiment import FitConfig
 from vertiwm_jax.learning.identification import MASS, Identified
+from vertiwm_jax.mechanics import vehicle as vehicles
 from vertiwm_jax.mechanics.vehicle import HMMWV
+from vertiwm_jax.models.registry import load_model, moving
 from vertiwm_jax.state import STEP_SECONDS
 
 
@@ -46,7 +48,8 @@ class Identify:
     """How drives are shared out whose files do not say what they are for; those to train are used,
     and to adapt also those for validation."""
     model: Path | None = None
-    """Folder of a model, or `any_vehicle`, to adapt to the vehicle by `configs/adapt.yaml`."""
+    """Folder of a model, or `any_vehicle`, to adapt to the vehicle by `configs/adapt.yaml`. It gets
+    the numbers that were found if it predicts the drives better with them, else the given ones."""
     runs: Path = Path("runs")
     """Folder in which the folder of the adapted model is made."""
     picture: Path | None = None
@@ -75,12 +78,24 @@ def run(name: str, words: list[str]) -> None:
     if command.picture is not None:
         figures.save(plots.identified(found), command.picture)
     print("\n".join(_told(found)))
-    model = "--model builtin"
+    model, vehicle = "--model builtin", str(command.output)
+    print(f"the vehicle is in {vehicle}")
     if command.model is not None:
-        run = experiment.run(replace(adapt, data=drives, vehicle=str(command.output)))
+        moved, params = load_model("vertiwm", command.model)
+        given = vehicles.load(command.vehicle)
+        before, after = (moving(params, each.vehicle) for each in (given, found.vehicle))
+        recorded = load_drives(drives, "train", command.splits, wheels=False)
+        gained = prediction.gain(moved, before, after, *recorded)
+        better = gained.low > 0
+        vehicle = vehicle if better else command.vehicle
+        print(
+            f"The model errs by {gained} m less with what was found than with what was given; "
+            f"it is adapted with what was {'found' if better else 'given'}."
+        )
+        run = experiment.run(replace(adapt, data=drives, vehicle=vehicle))
         model = f"--weights {run / 'model'}"
-    print(f"the vehicle is in {command.output}; to train with it:")
-    print(f"python -m vertiwm_jax.ppo {model} --vehicle {command.output}")
+    print("to train with it:")
+    print(f"python -m vertiwm_jax.ppo {model} --vehicle {vehicle}")
 
 
 def _told(found: Identified) -> list[str]:

@@ -304,6 +304,16 @@ def prediction_errors(
     return summary(name, predict(dynamics, params, test).states, test)
 
 
+def gain(
+    dynamics: Dynamics, before: Params, after: Params, drives: Drives, terrain: TerrainMap
+) -> Interval:
+    """By how much less a model errs with other parameters, m after 16 steps."""
+    test = TestWindows.of(drives, terrain, context=16, horizon=16, stride=16)
+    states = (predict(dynamics, params, test).states for params in (before, after))
+    worse, better = (absolute_errors(each, test)[0]["position"][:, -1] for each in states)
+    return bootstrap(worse - better, np.arange(len(worse)))
+
+
 def format_table(models: Sequence[PredictionErrors], measure: str) -> str:
     """A Markdown table of one measure, one model a row, one kind of ground a column."""
     rows = []
