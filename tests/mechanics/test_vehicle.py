@@ -59,6 +59,8 @@ def test_a_rover_at_full_size_is_about_an_hmmwv():
         ("locked", "rear", "locked: expected none or front, as these wheels are driven"),
         ("wheel_radius", [0.5, 0.0], "wheel_radius: expected more than 0, found (0.5, 0.0)"),
         ("mass", "heavy", "mass: expected float, found 'heavy'"),
+        ("scale", 1.0, "scale: expected about 8.5, by which wheels become as large as an HMMWV's"),
+        ("length", 1.2, "length: expected corners within 0.56 m of the middle"),
     ],
 )
 def test_what_cannot_be_a_vehicle_is_named(tmp_path, field, value, words):

@@ -12,14 +12,19 @@ from flax import struct
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import froude
-from vertiwm_jax.config import Positive, settings
+from vertiwm_jax.config import ConfigError, Positive, settings
 from vertiwm_jax.errors import UserError
 from vertiwm_jax.precision import float32
-from vertiwm_jax.state import Command, Turn
+from vertiwm_jax.state import STEP_SECONDS, Command, Turn
+from vertiwm_jax.terrain.patches import PATCH_METERS
 
 GRAVITY = 9.81
 HMMWV = "hmmwv"
 """Name of the default vehicle."""
+_WHEELS = 0.15, 1.5
+"""m, radius at full size, for which time steps, patches and tasks are made."""
+_SEEN = PATCH_METERS / 2 - 8.0 * STEP_SECONDS
+"""m about a vehicle that a patch still covers when it has moved for a step, at 8 m/s."""
 _AXLES = {"all": (1, 1, 1, 1), "rear": (0, 0, 1, 1), "front": (1, 1, 0, 0), "none": (0, 0, 0, 0)}
 
 
@@ -333,7 +338,20 @@ def load(name: str) -> VehicleConfig:
     """
     of_file = name.endswith((".yaml", ".yml"))
     path = Path(name) if of_file else configuration.default_config(f"vehicles/{name}")
-    return configuration.load(VehicleConfig, path)
+    found = configuration.load(VehicleConfig, path)
+    wheel, reach = np.max(found.wheel_radius), np.hypot(found.length, found.width) / 2
+    least, most = _WHEELS
+    if not least <= found.scale * wheel <= most:
+        raise ConfigError(
+            f"{path}: scale: expected about {0.467 / wheel:.2g}, by which wheels become as large "
+            f"as an HMMWV's, found {found.scale:g}"
+        )
+    if found.scale * reach > _SEEN:
+        raise ConfigError(
+            f"{path}: length: expected corners within {_SEEN / found.scale:.2g} m of the middle, "
+            f"as models see no farther, found {reach:.2g} m"
+        )
+    return found
 
 
 @float32
