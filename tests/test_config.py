@@ -110,6 +110,7 @@ optimizer: {learning_rate: 1e-3, clip: 1, anneal: off}
     ("text", "words"),
     [
         ("name: x\nsede: 1", ["sede", "unknown key", "did you mean 'seed'?"]),
+        ('"a\\nb": 1', [r"'a\nb': unknown key"]),
         ("name: x\noptimizer: {learnin_rate: 1}", ["optimizer.learnin_rate", "'learning_rate'?"]),
         ("name: x\nseed: 1.5", ["seed", "expected int", "found 1.5 (float)"]),
         ("name: x\nseed: true", ["seed", "expected int", "found True (bool)"]),

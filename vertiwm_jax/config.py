@@ -223,7 +223,8 @@ def _convert_dataclass(value: Any, cls: Any, field: str, base: Any = None) -> An
         place = _join(field, key)
         if key not in fields:
             said = gone.get(key) or f"unknown key, expected {choices(str(key), fields)}"
-            raise _MismatchError(f"{place}: {said}")
+            shown = place if str(key).isprintable() else _join(field, repr(key))
+            raise _MismatchError(f"{shown}: {said}")
         inner = getattr(base, key, fields[key].default)
         if isinstance(item, dict) and dataclasses.is_dataclass(inner):
             converted[key] = _convert_dataclass(item, type(inner), place, inner)
