@@ -9,6 +9,7 @@ from vertiwm_jax import config, machine
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.suites import GroundConfig
+from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import TaskConfig
@@ -53,3 +54,10 @@ def test_a_vehicle_that_is_none_is_named(tmp_path):
     (tmp_path / "task.yaml").write_text("vehicle: rovr")
     with pytest.raises(ConfigError, match=r"task\.yaml: .*did you mean 'rover'"):
         config.load(TaskConfig, tmp_path / "task.yaml")
+
+
+def test_a_skid_steered_vehicle_is_not_told_to_drive_faster_than_it_can_turn():
+    TaskConfig(vehicle="husky", navigation=NavigationConfig(speed_range=(0.0, 1.3)))
+    with pytest.raises(ValueError, match=r"speed_range: expected at most 1\.33 m/s at full size"):
+        TaskConfig(vehicle="husky")
+    TaskConfig(vehicle="warthog")  # It is faster than the task asks.

@@ -152,6 +152,11 @@ class Vehicle:
         speed = (command.speed - low) / (high - low) * 2 - 1
         return jnp.clip(jnp.stack([speed, command.steering / self.steering_limit], -1), -1.0, 1.0)
 
+    @property
+    def fastest(self) -> jax.Array:
+        """`[]` m/s, beyond which the engine does not turn the wheels."""
+        return self.wheel_speed_limit * self.wheel_radius.mean()
+
     def select(self, which: jax.Array) -> "Vehicle":
         """One of stacked vehicles, by its number `[]`."""
         return jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], self)
@@ -160,8 +165,7 @@ class Vehicle:
         """`[...]` 1/m of the arcs driven at a steering in [-1, 1], left positive; those of a
         skid-steered vehicle at the largest speed of its wheels."""
         if self.skid is not None:
-            fastest = self.wheel_speed_limit * self.wheel_radius.mean()
-            return self.steering_limit * steering / fastest
+            return self.steering_limit * steering / self.fastest
         return jnp.tan(self.steering_limit * steering) / self.wheelbase
 
 

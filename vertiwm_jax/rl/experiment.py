@@ -77,7 +77,13 @@ class TaskConfig:
     """The built-in simulator."""
 
     def check(self):
-        vehicle.load(self.vehicle)  # That it cannot be read is to be said now.
+        driven = self.driven.vehicle  # That it cannot be read is to be said now.
+        fastest, (_, asked) = float(driven.fastest), self.navigation.speed_range
+        if driven.skid is not None and asked > fastest:
+            raise ValueError(
+                f"navigation.speed_range: expected at most {fastest:.3g} m/s at full size, as "
+                f"{self.vehicle} cannot turn where both sides are at their limit, found {asked:g}"
+            )
 
     @property
     def fixed_dtype(self) -> ComputeDtype:
