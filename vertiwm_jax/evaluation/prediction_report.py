@@ -94,20 +94,17 @@ class PredictionTest:
             _log.info("%s; predicted: %s", collection, split)
         dataset.expect_drives(collections, split, self.context + max(self.horizons))
         given = vehicle.load(self.vehicle or vehicle.HMMWV).vehicle
+        learned = self._models(self.weights) if self.weights else {}
+        for folder in self.compare:
+            fitted = load_fitted(folder / "model")
+            learned |= {f"{folder.name}: {part}": model for part, model in fitted.items()}
         drives, terrain = dataset.load_drives(self.data, split, self.splits)
         if self.vehicle:
             drives = replace(drives, described=(None,) * terrain.worlds)
         driven = drives.driven(given)
-        of_any = any(drives.described) or not vehicle.equal(given, vehicle.load_vehicle())
-        weights = self.weights or ("any_vehicle" if of_any else "pretrained")
-        learned: dict[str, tuple[Dynamics, Params]] = {
-            name: load_model(name, weights, soil=self.soil)
-            for name in self.models
-            if name != "builtin"
-        }
-        for folder in self.compare:
-            fitted = load_fitted(folder / "model")
-            learned |= {f"{folder.name}: {part}": model for part, model in fitted.items()}
+        if not self.weights:
+            of_any = any(drives.described) or not vehicle.equal(given, vehicle.load_vehicle())
+            learned = self._models("any_vehicle" if of_any else "pretrained") | learned
         models: dict[str, tuple[Dynamics, Params | Partial, Vehicle | None]] = {}
         for name, (dynamics, params) in learned.items():
             if params.vehicle.turn != drives.turn:
@@ -152,6 +149,14 @@ class PredictionTest:
         if self.json:
             atomic.write(self.json, yardsticks.json_text(found))
         return "\n\n".join(tables)
+
+    def _models(self, weights: str | Path) -> dict[str, tuple[Dynamics, Params]]:
+        """The models that are asked for, but for the simulator, with these weights."""
+        return {
+            name: load_model(name, weights, soil=self.soil)
+            for name in self.models
+            if name != "builtin"
+        }
 
 
 def _files(
