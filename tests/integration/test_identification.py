@@ -11,9 +11,11 @@ import vertiwm_jax as vw
 from vertiwm_jax import cli
 from vertiwm_jax import config as configuration
 from vertiwm_jax.config import ConfigError
-from vertiwm_jax.learning import experiment
+from vertiwm_jax.evaluation import prediction
+from vertiwm_jax.evaluation.prediction import Interval
+from vertiwm_jax.learning import experiment, identification
 from vertiwm_jax.learning.dataset import load_drives
-from vertiwm_jax.learning.identification import MASS, NINETY
+from vertiwm_jax.learning.identification import MASS, NINETY, Identified, Number
 from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
@@ -136,13 +138,29 @@ def test_logs_are_imported_first_and_a_model_is_adapted_then(tmp_path, monkeypat
     assert not output.exists() and not output.with_suffix(".drives").exists()
     cli.main("identify", [*asked, "any_vehicle"])
     (config,) = fitted
-    # So few drives do not show that the model errs less with what was found.
-    assert config.data == (tmp_path / "my.drives",) and config.vehicle == "hmmwv"
+    assert config.data == (tmp_path / "my.drives",)
     assert config.model.vehicles == "any" and config.start.name == "any_vehicle"
     assert len(load_drives(config.data, "all")[0].length) == 1
+    assert f"--weights {tmp_path / 'run' / 'model'}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_a_model_is_adapted_with_the_numbers_that_it_predicts_best_with(
+    drives, better, tmp_path, monkeypatch, capsys
+):
+    fitted, output = [], str(tmp_path / "my.yaml")
+    given = vehicle.load("hmmwv")
+    numbers = (Number("mass", 1.0, 0.9, 1.1, 2.0, None),)
+    found = Identified(given, numbers, (0.0, 0.0, 0.0), np.ones(8), np.ones(8))
+    gain = Interval(0.02, 0.01 if better else -0.01, 0.03)
+    monkeypatch.setattr(experiment, "run", lambda config: fitted.append(config) or tmp_path)
+    monkeypatch.setattr(identification, "identify", lambda *_, **__: found)
+    monkeypatch.setattr(prediction, "gain", lambda *_: gain)
+    cli.main("identify", [str(drives), "--output", output, "--model", "any_vehicle"])
+    kept, which = (output, "found") if better else ("hmmwv", "given")
+    assert [config.vehicle for config in fitted] == [kept]
     told = capsys.readouterr().out
-    assert "it is adapted with what was given" in told
-    assert f"--weights {tmp_path / 'run' / 'model'} --vehicle hmmwv" in told
+    assert f"adapted with what was {which}" in told and f"--vehicle {kept}" in told
 
 
 def test_what_cannot_be_identified_is_named(drives):
