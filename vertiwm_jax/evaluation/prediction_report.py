@@ -29,6 +29,7 @@ from vertiwm_jax.mechanics.kinematic import (
 )
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import Vehicle
+from vertiwm_jax.models import files
 from vertiwm_jax.models.config import SoilSource
 from vertiwm_jax.models.registry import ModelName, load_fitted, load_model, moves_any, moving
 from vertiwm_jax.runs import Progress
@@ -103,8 +104,8 @@ class PredictionTest:
             drives = replace(drives, described=(None,) * terrain.worlds)
         driven = drives.driven(given)
         if not self.weights:
-            of_any = any(drives.described) or not vehicle.equal(given, vehicle.load_vehicle())
-            learned = self._models("any_vehicle" if of_any else "pretrained") | learned
+            shipped = files.ANY_VEHICLE if any(drives.described) else files.shipped(given)
+            learned = self._models(shipped) | learned
         models: dict[str, tuple[Dynamics, Params | Partial, Vehicle | None]] = {}
         for name, (dynamics, params) in learned.items():
             if params.vehicle.turn != drives.turn:
@@ -143,14 +144,14 @@ class PredictionTest:
                     name: prediction.summary(name, each.states, test).growth
                     for name, each in cut.items()
                 }
-                files = {"prediction.csv": csv_text([vars(row) for row in found])}
-                files |= {"prediction.png": error_growth(growth)}
-                write(self.output, files | dict(_files(tables, test, drawn)))
+                written = {"prediction.csv": csv_text([vars(row) for row in found])}
+                written |= {"prediction.png": error_growth(growth)}
+                write(self.output, written | dict(_files(tables, test, drawn)))
         if self.json:
             atomic.write(self.json, yardsticks.json_text(found))
         return "\n\n".join(tables)
 
-    def _models(self, weights: str | Path) -> dict[str, tuple[Dynamics, Params]]:
+    def _models(self, weights: Path) -> dict[str, tuple[Dynamics, Params]]:
         """The models that are asked for, but for the simulator, with these weights."""
         return {
             name: load_model(name, weights, soil=self.soil)

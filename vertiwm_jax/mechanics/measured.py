@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.errors import refusing
-from vertiwm_jax.mechanics.vehicle import GRAVITY, VehicleConfig
+from vertiwm_jax.mechanics.vehicle import GRAVITY, HMMWV_RADIUS, VehicleConfig
 
 RIDE_FREQUENCY = 2.0
 """Hz, of a quarter of a vehicle on its spring, where spring rates are not known."""
@@ -53,7 +53,6 @@ _KEYS = (
 )
 _SPAN = 3  # steps of 0.1 s over which accelerations are taken
 _SLIPPING = 0.85  # share of friction's acceleration from which on tires set the limit
-_HMMWV_RADIUS = 0.467
 
 
 def is_described(facts: Any) -> bool:
@@ -123,7 +122,7 @@ def _measured(facts: Mapping[str, Any]) -> VehicleConfig:
         wheel_power=float(
             design.get("wheel_power", bench.hidden(1.25) * (engine * bench.speed).max())
         ),
-        wheel_speed_limit=100 * float(_HMMWV_RADIUS / size) ** 0.5,
+        wheel_speed_limit=100 * float(HMMWV_RADIUS / size) ** 0.5,
         brake_torque=float(design.get("brake_torque", bench.braking(1.5) * moved * size / 4)),
         tyre_friction=friction,
         hull=_floats(hull),

@@ -21,6 +21,8 @@ from vertiwm_jax.terrain.patches import PATCH_METERS
 GRAVITY = 9.81
 HMMWV = "hmmwv"
 """Name of the default vehicle."""
+HMMWV_RADIUS = 0.467
+"""m, of its wheels."""
 _WHEELS = 0.15, 1.5
 """m, radius at full size, for which time steps, patches and tasks are made."""
 _SEEN = PATCH_METERS / 2 - 8.0 * STEP_SECONDS
@@ -347,8 +349,8 @@ def load(name: str) -> VehicleConfig:
     least, most = _WHEELS
     if not least <= found.scale * wheel <= most:
         raise ConfigError(
-            f"{path}: scale: expected about {0.467 / wheel:.2g}, by which wheels become as large "
-            f"as an HMMWV's, found {found.scale:g}"
+            f"{path}: scale: expected about {HMMWV_RADIUS / wheel:.2g}, by which wheels become as "
+            f"large as an HMMWV's, found {found.scale:g}"
         )
     if found.scale * reach > _SEEN:
         raise ConfigError(

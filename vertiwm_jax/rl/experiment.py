@@ -78,7 +78,7 @@ class TaskConfig:
 
     def check(self):
         driven = self.driven.vehicle  # That it cannot be read is to be said now.
-        fastest, (_, asked) = float(driven.fastest), self.navigation.speed_range
+        fastest, asked = float(driven.fastest), max(map(abs, self.navigation.speed_range))
         if driven.skid is not None and asked > fastest:
             raise ValueError(
                 f"navigation.speed_range: expected at most {fastest:.3g} m/s at full size, as "
