@@ -255,7 +255,7 @@ def trained(bench: Benchmark) -> Found:
         command = [sys.executable, "-m", "vertiwm_jax.ppo", "--config", str(file)]
         # This process has three quarters of the device's memory.
         given = os.environ | {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.2"}
-        given.pop("JAX_COMPILATION_CACHE_DIR", None)
+        given["JAX_COMPILATION_CACHE_DIR"] = folder
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
         start = time.monotonic()
         with subprocess.Popen(command, env=given, text=True, **pipes) as process:

@@ -19,5 +19,5 @@ END
 python3 -m pip download --quiet --dest "$folder" --constraint "$limits" --no-deps \
   --only-binary=:all: --python-version 3.12 --platform manylinux_2_28_x86_64 \
   gymnax "gymnasium<1.4" farama-notifications jaxlie jax-dataclasses tyro docstring-parser \
-  typeguard tensorboardx
+  typeguard tensorboardx platformdirs filelock
 du -ch "$folder"/*.whl

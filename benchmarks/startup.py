@@ -41,20 +41,20 @@ def phases(name: str) -> dict[str, dict[str, float]]:
 
     jax.monitoring.register_event_duration_secs_listener(note)
     from vertiwm_jax import config as configuration
-    from vertiwm_jax import machine, parallel, training
+    from vertiwm_jax import machine, parallel, training, xla
     from vertiwm_jax.env.navigation import NavigationEnv
     from vertiwm_jax.rl import experiment
     from vertiwm_jax.rl.experiment import PPOTraining
     from vertiwm_jax.training import Seeds
 
     lap("import")
-    training.keep_compiled(None)  # in the folder of the environment
+    xla.keep_compiled()  # in the folder of the environment
     config = configuration.load(PPOTraining, configuration.default_config(name))
     terrain, pool, _ = jax.block_until_ready(experiment.training_ground(config))
     machine.forget_programs()
     lap("worlds")
     dynamics, weights = experiment.dynamics(config, config.model)
-    env = NavigationEnv(dynamics, config.navigation, config.variation)
+    env = NavigationEnv(dynamics, config.navigation, config.variation, settling=config.simulator)
     algorithm = Seeds(config.algorithm(env), config.loop.seeds)
     encoders = experiment.encoders(config)
     shapes = env.make_params(weights, terrain, pool, encoders=encoders, settled=False)

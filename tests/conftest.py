@@ -1,11 +1,17 @@
 import os
+import shutil
 import signal
+import tempfile
 from pathlib import Path
 
 # The suite is a statement about the CPU in float32; before anything imports jax.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # So that what is shared out to devices is, also where a worker has one core.
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")
+# Workers keep compiled programs where the process that starts them does, which removes the folder.
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR", os.path.join(tempfile.gettempdir(), f"vertiwm-tests-{os.getpid()}")
+)
 
 import jax
 import pytest
@@ -32,6 +38,13 @@ if worker and hasattr(os, "sched_setaffinity"):
 
 # Shells start what runs in the background with Ctrl-C ignored, and tests press it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_unconfigure() -> None:
+    """Removes what was compiled."""
+    kept = os.environ["JAX_COMPILATION_CACHE_DIR"]
+    if kept.endswith(f"vertiwm-tests-{os.getpid()}"):
+        shutil.rmtree(kept, ignore_errors=True)
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -1,8 +1,7 @@
 """What tests of commands share."""
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -11,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 
 from vertiwm_jax import cli
 from vertiwm_jax import config as configuration
@@ -31,25 +29,19 @@ def door(name: str) -> Door:
     return partial(cli.main, name)
 
 
-@contextmanager
-def opened(door: Door, folder: Path, *first: str) -> Iterator[Callable[..., Path]]:
+def opened(door: Door, folder: Path, *first: str) -> Callable[..., Path]:
     """The command as a function of its arguments, which gives the newest run folder.
 
     first: arguments of every run that does not go on with an earlier one.
     """
-    # What one run has compiled, the next finds there.
-    cache, runs = ["--compile-cache", str(folder / "compiled")], folder / "runs"
+    runs = folder / "runs"
 
     def run(*argv: str) -> Path:
         begin = [] if "--resume" in argv else [*first, "--runs", str(runs)]
-        door([*begin, *cache, *argv])
+        door([*begin, *argv])
         return max(runs.iterdir(), key=lambda run: run.stat().st_ctime_ns)
 
-    try:
-        yield run
-    finally:
-        jax.config.update("jax_compilation_cache_dir", None)
-        compilation_cache.reset_cache()  # Else later tests go on writing to it.
+    return run
 
 
 def refusal(door: Door, *argv: object) -> str:

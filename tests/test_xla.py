@@ -1,4 +1,7 @@
-"""Options that the installed XLA does not know are left out and told, and never end a process."""
+"""Options that the installed XLA does not know are left out and told, and never end a process.
+
+Nor does what is kept of compiled programs, whatever is found there.
+"""
 
 import os
 import subprocess
@@ -60,3 +63,52 @@ def test_a_program_of_ones_own_options_keeps_them():
     brief = xla.brief_jit(jnp.sin, compiler_options={UNKNOWN: 1})
     with pytest.raises(jax.errors.JaxRuntimeError, match=UNKNOWN):
         brief(jnp.float32(1))
+
+
+TWICE = """
+from collections import Counter
+import jax, jax.numpy as jnp
+from vertiwm_jax import xla
+
+seen = Counter()
+jax.monitoring.register_event_listener(lambda event, **_: seen.update([event]))
+xla.keep_compiled()
+assert jax.jit(lambda x: 2 * x)(jnp.float32(3)) == 6
+print(seen["/jax/compilation_cache/cache_hits"], seen["/jax/compilation_cache/cache_misses"])
+"""
+
+
+@pytest.fixture
+def twice(tmp_path):
+    """Doubles a number in a process that keeps programs; says how many it found and missed."""
+
+    def run(**changed):
+        environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache"), **changed}
+        del environment["JAX_COMPILATION_CACHE_DIR"]
+        done = subprocess.run(
+            [sys.executable, "-c", TWICE], env=environment, check=True, capture_output=True
+        )
+        return [int(word) for word in done.stdout.split()]
+
+    return run
+
+
+def test_programs_are_kept_in_the_folder_of_the_user(twice, tmp_path):
+    found, missed = twice()
+    assert found == 0 and missed > 0
+    assert twice() == [missed, 0]
+    (folder,) = (tmp_path / "cache" / "vertiwm_jax").iterdir()
+    assert folder.name == f"programs-{xla.cpu()}"
+    for file in folder.glob("*-cache"):
+        file.write_bytes(b"damaged")
+    assert twice()[0] == 0
+
+
+def test_programs_are_kept_nowhere_if_so_told(twice, tmp_path):
+    assert twice(JAX_ENABLE_COMPILATION_CACHE="false") == [0, 0]
+    assert not [*(tmp_path / "cache").rglob("*-cache")]
+
+
+def test_a_folder_that_cannot_be_made_keeps_nobody_from_working(twice, tmp_path):
+    (tmp_path / "cache").write_text("a file")
+    assert twice()[0] == 0

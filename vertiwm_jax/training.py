@@ -142,16 +142,6 @@ def all_finite(tree: Any) -> jax.Array:
     return jnp.all(jnp.isfinite(ravel_pytree(tree)[0]))
 
 
-def keep_compiled(folder: Path | None) -> None:
-    """Keeps compiled programs in a folder, or in the one that JAX was told of, for later processes.
-
-    Small ones too: a start has a hundred of them.
-    """
-    if folder:
-        jax.config.update("jax_compilation_cache_dir", str(folder.absolute()))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-
-
 def restore(algorithm: Algorithm[State], data: Any, folder: Path) -> tuple[int, State] | None:
     """Iterations done and state in the newest checkpoint of the run in `folder`, if it has one.
 

@@ -1,18 +1,27 @@
-"""Options of XLA, the compiler. Options that the installed version does not know are left out."""
+"""Options of XLA, the compiler, and where its programs are kept.
+
+Options that the installed version does not know are left out.
+"""
 
 import functools
+import hashlib
 import os
+import platform
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
+import platformdirs
 
 T = TypeVar("T")
 
 _BRIEF = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 _READ_FLAGS = "from jaxlib import xla_client; xla_client.CompileOptions()"
+_CPU = ("vendor_id", "cpu family", "model", "model name", "flags", "Features")
+_KEPT = 1 << 30  # bytes
 _left_out: set[str] = set()
 
 
@@ -53,6 +62,32 @@ def brief_jit(function: Callable[..., T], **options: Any) -> Callable[..., T]:
         return compiled()(*args, **kwargs)
 
     return call
+
+
+def keep_compiled() -> None:
+    """Keeps compiled programs for later processes; beyond 1 GB, those used longest ago go.
+
+    They lie where JAX was told (`JAX_COMPILATION_CACHE_DIR`), or in the user's folder of caches, in
+    one for this kind of CPU. `JAX_ENABLE_COMPILATION_CACHE=false` turns it off.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        kept = platformdirs.user_cache_path("vertiwm_jax") / f"programs-{cpu()}"
+        jax.config.update("jax_compilation_cache_dir", str(kept))
+    jax.config.update("jax_compilation_cache_max_size", _KEPT)
+    # Small ones too: a start has a hundred of them.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+
+def cpu() -> str:
+    """A name of this kind of CPU: a program for one may not run on another.
+
+    JAX does not tell them apart (jax-ml/jax#38445).
+    """
+    told, cpuinfo = [platform.machine(), platform.processor()], Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        first = cpuinfo.read_text(encoding="utf-8").split("\n\n")[0].splitlines()
+        told += [line for line in first if line.split(":")[0].strip() in _CPU]
+    return hashlib.sha256("\n".join(told).encode()).hexdigest()[:12]
 
 
 def _accepts(flags: Iterable[str]) -> bool:

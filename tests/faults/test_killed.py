@@ -133,7 +133,6 @@ def commands(request, tmp_path, drives):
         (tmp_path / "tiny.yaml").write_text(TINY.replace(SHORT, LONGER))
         argv = ["--config", str(tmp_path / "tiny.yaml"), "--data", str(drives / "drives")]
         parts = STAGES
-    argv += ["--compile-cache", str(tmp_path / "compiled")]
     for name in ("alone", "killed"):
         (tmp_path / name).mkdir()
     return [

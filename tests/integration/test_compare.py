@@ -33,22 +33,22 @@ def test_policies_are_trained_once_and_judged_together(tmp_path, monkeypatch):
     (tmp_path / "ppo.yaml").write_text(SHARED + PPO)
     (tmp_path / "table.yaml").write_text(TABLE)
     first = ["--config", str(tmp_path / "table.yaml"), "--settings", str(tmp_path)]
-    with opened(door("compare"), tmp_path, *first) as table:
-        run = table()
-        trainings = [*run.glob("ppo_in_*/ppo-*")]
-        assert sorted(path.parent.name for path in trainings) == ["ppo_in_builtin", "ppo_in_nesam"]
-        text = (run / "table.md").read_text()
-        for policy in ("ppo in builtin", "ppo in nesam", "straight to goal"):
-            assert f"| {policy} |" in squeezed(text)
-        assert (run / "builtin" / "episodes.csv").read_text().count("straight to goal") == 10
-        # Stopped before its test: it is not trained again, but tested.
-        (nesam,) = run.glob("ppo_in_nesam/ppo-*")
-        before, kept = runs.read_metrics(nesam), (nesam / "config.yaml").read_text()
-        faster = machine.multiplies_bfloat16()
-        monkeypatch.setattr(machine, "multiplies_bfloat16", lambda: not faster)
-        (nesam / "summary.json").unlink()
-        shutil.rmtree(run / "builtin")
-        table("--resume", str(run))
+    table = opened(door("compare"), tmp_path, *first)
+    run = table()
+    trainings = [*run.glob("ppo_in_*/ppo-*")]
+    assert sorted(path.parent.name for path in trainings) == ["ppo_in_builtin", "ppo_in_nesam"]
+    text = (run / "table.md").read_text()
+    for policy in ("ppo in builtin", "ppo in nesam", "straight to goal"):
+        assert f"| {policy} |" in squeezed(text)
+    assert (run / "builtin" / "episodes.csv").read_text().count("straight to goal") == 10
+    # Stopped before its test: it is not trained again, but tested.
+    (nesam,) = run.glob("ppo_in_nesam/ppo-*")
+    before, kept = runs.read_metrics(nesam), (nesam / "config.yaml").read_text()
+    faster = machine.multiplies_bfloat16()
+    monkeypatch.setattr(machine, "multiplies_bfloat16", lambda: not faster)
+    (nesam / "summary.json").unlink()
+    shutil.rmtree(run / "builtin")
+    table("--resume", str(run))
     assert [*run.glob("ppo_in_*/ppo-*")] == trainings
     assert runs.read_metrics(nesam) == before
     assert (nesam / "config.yaml").read_text() == kept

@@ -58,8 +58,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def train(folder):
     """Runs the door, with the tiny settings first; gives the newest run folder."""
-    with opened(door("ppo"), folder, "--config", str(folder / "tiny.yaml")) as train:
-        yield train
+    return opened(door("ppo"), folder, "--config", str(folder / "tiny.yaml"))
 
 
 @pytest.fixture(scope="module")
@@ -136,13 +135,13 @@ def test_other_algorithms_leave_the_same_and_resume(name, folder, tmp_path):
     tiny = TINY[: TINY.index("planning")].replace("settle_steps", "embeddings: true, settle_steps")
     tiny += f"{name}: {settings}\nloop: {{checkpoint_every: 2}}\n"
     (tmp_path / "tiny.yaml").write_text(tiny)
-    with opened(door(name), folder, "--config", str(tmp_path / "tiny.yaml")) as train:
-        run = train()
-        assert run.name.startswith(name)
-        assert [line["step"] for line in runs.read_metrics(run)] == [1, 2, 3]
-        stopped = shutil.copytree(run, tmp_path / "stopped")
-        shutil.rmtree(stopped / "checkpoints" / "3")
-        train("--resume", str(stopped))
+    train = opened(door(name), folder, "--config", str(tmp_path / "tiny.yaml"))
+    run = train()
+    assert run.name.startswith(name)
+    assert [line["step"] for line in runs.read_metrics(run)] == [1, 2, 3]
+    stopped = shutil.copytree(run, tmp_path / "stopped")
+    shutil.rmtree(stopped / "checkpoints" / "3")
+    train("--resume", str(stopped))
     assert numbers(stopped) == numbers(run)
     chex.assert_trees_all_equal(learned(stopped), learned(run))
     door("evaluate")(["navigation", "--policy", str(run), "--output", str(tmp_path / "found")])

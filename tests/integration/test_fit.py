@@ -60,8 +60,7 @@ def folder(tmp_path_factory):
 def fitted(folder):
     """Runs the door; gives the newest run folder."""
     tiny, drives = folder / "tiny.yaml", folder / "drives"
-    with opened(door("fit"), folder, "--config", str(tiny), "--data", str(drives)) as fitted:
-        yield fitted
+    return opened(door("fit"), folder, "--config", str(tiny), "--data", str(drives))
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from types import ModuleType
 
 import jax
 
-from vertiwm_jax import hosts, machine
+from vertiwm_jax import hosts, machine, xla
 from vertiwm_jax.errors import TrainingInterrupted, UserError
 
 _TRAININGS = ("ppo", "sac", "td3")
@@ -58,6 +58,7 @@ def main(name: str | None = None, words: Sequence[str] | None = None) -> None:
 def prepare(name: str) -> None:
     """Sets up all cores and hosts for a command; to be called before gymnax, which starts JAX."""
     machine.use_cores()
+    xla.keep_compiled()
     # Tracing makes many lasting objects; looking for garbage among them is a sixth of its time.
     gc.set_threshold(100_000, 50, 50)
     # gymnax imports it to draw Pong, which would be two seconds of every start.

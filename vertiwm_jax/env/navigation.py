@@ -20,6 +20,7 @@ from vertiwm_jax.env.suites import GroundConfig, TaskError, Tasks, validate
 from vertiwm_jax.env.task import NavigationConfig, TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason, edge_distance, first_ending, is_terminal
 from vertiwm_jax.mechanics.kinematic import place
+from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, load_vehicle
 from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
 from vertiwm_jax.perception.features import Encoders
@@ -45,6 +46,8 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         decisions to assign credit to (Mnih et al., 2015).
     base: a controller that acts at every step. The held action, in [-1, 1], is added to its action
         (Silver et al., 2018, "Residual policy learning").
+    settling: in which starts come to rest; in the model itself by default, which takes longer if
+        that has learned weights.
     """
 
     dynamics: Dynamics
@@ -52,6 +55,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
     variation: RandomizationConfig = RandomizationConfig()
     action_repeat: int = 1
     base: Policy | None = None
+    settling: Simulator | None = None
 
     @float32
     def make_params(
@@ -64,7 +68,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         *,
         settled: bool = True,
     ) -> TaskParams:
-        """Parameters whose pool of starts is `tasks`, each settled on the ground by the model.
+        """Parameters whose pool of starts is `tasks`, each settled on the ground.
 
         Args:
             dynamics: the model's parameters.
@@ -301,27 +305,32 @@ def _settle(
     params: without starts; numbers: `[P]` int32, of the routes to the goals.
     """
     model, config = env.dynamics, env.config
+    rests, constants = model, params.dynamics
+    if env.settling:
+        rests, constants = env.settling, chrono_like(params.vehicle)
 
     def standing() -> Command:
         # Made where it is used: from outside of what devices share, it would be another type.
         return Command(jnp.float32(0), jnp.float32(0))
 
-    @partial(parallel.vmap, in_axes=(None, 0))
-    def begin(params: TaskParams, task: Tasks) -> _Placed:
+    @partial(parallel.vmap, in_axes=(None, None, 0))
+    def begin(params: TaskParams, constants: Params, task: Tasks) -> _Placed:
         terrain = params.terrain.select(task.world)
         state = place(terrain, task.start, task.yaw, vehicle=params.vehicle)
-        return state, model.init(params.dynamics, terrain, state)
+        return state, rests.init(constants, terrain, state)
 
-    @partial(parallel.vmap, in_axes=(None, 0, 0))
-    def stand(params: TaskParams, task: Tasks, placed: _Placed) -> _Placed:
+    @partial(parallel.vmap, in_axes=(None, None, 0, 0))
+    def stand(params: TaskParams, constants: Params, task: Tasks, placed: _Placed) -> _Placed:
         (state, history), terrain = placed, params.terrain.select(task.world)
-        return step(model, params.dynamics, terrain, history, state, standing())
+        return step(rests, constants, terrain, history, state, standing())
 
     @partial(parallel.vmap, in_axes=(None, 0, 0, 0))
     def start(
         params: TaskParams, task: Tasks, number: jax.Array, placed: _Placed
     ) -> tuple[TaskState, jax.Array]:
         (vehicle, history), terrain = placed, params.terrain.select(task.world)
+        if env.settling:
+            history = model.init(params.dynamics, terrain, vehicle)
         action, zero = params.vehicle.action(standing(), config.speed_range), jnp.int32(0)
         seen = None
         if config.sensing.partial:
@@ -344,8 +353,8 @@ def _settle(
     # Steps of all, and not all steps of each: inside of `vmap`, a scan is traced again until it is
     # known what of a history differs between vehicles.
     at_rest, _ = jax.lax.scan(
-        lambda placed, _: (stand(params, tasks, placed), None),
-        begin(params, tasks),
+        lambda placed, _: (stand(params, constants, tasks, placed), None),
+        begin(params, constants, tasks),
         length=config.settle_steps,
     )
     return start(params, tasks, numbers, at_rest)
@@ -381,9 +390,9 @@ def make_env(
 
     Returns:
         The environment, and its parameters with a pool of W * `pairs` starts, each settled on the
-        ground by the model. `reset(key, params)` gives an observation `[O]` and a state, and
-        `step(key, state, action, params)` with an action `[2]` in [-1, 1] the next ones, the
-        reward, whether the episode is over, and `info`.
+        ground by the built-in simulator. `reset(key, params)` gives an observation `[O]` and a
+        state, and `step(key, state, action, params)` with an action `[2]` in [-1, 1] the next
+        ones, the reward, whether the episode is over, and `info`.
 
     Raises:
         MapError, TaskError: a map is too small, or a task on it cannot be driven.
@@ -393,7 +402,7 @@ def make_env(
     machine.refuse_forked()
     driven = load_vehicle(vehicle) if isinstance(vehicle, str) else vehicle
     dynamics, params = load_model(model, weights, vehicle=driven, embeddings=config.embeddings)
-    env = NavigationEnv(dynamics, config)
+    env = NavigationEnv(dynamics, config, settling=None if model == "builtin" else Simulator())
     if terrain is None:
         terrain = suites.suite_worlds(GroundConfig(suite_worlds=2), jax.random.key(seed))
     elif not isinstance(terrain, TerrainMap):

@@ -23,7 +23,6 @@ from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import TRAININGS, TrainConfig
 from vertiwm_jax.runs import Run
-from vertiwm_jax.training import keep_compiled
 
 _log = logging.getLogger(__name__)
 
@@ -67,8 +66,6 @@ class CompareConfig:
     """Folder in which the folder of this run is made."""
     resume: Path | None = None
     """Folder of an earlier run to go on with; policies that are trained are not trained again."""
-    compile_cache: Path | None = None
-    """Folder that keeps compiled programs for later runs."""
 
     def check(self):
         if len(set(self.rows)) < len(self.rows):
@@ -82,7 +79,6 @@ def compare(config: CompareConfig) -> str:
     simulator.
     """
     Run.expect(config)
-    keep_compiled(config.compile_cache)
     settings = {row: training(config, row) for row in config.rows}
     vehicles = {chosen.vehicle for chosen in settings.values()}
     if len(vehicles) > 1:

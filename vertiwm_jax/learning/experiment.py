@@ -15,7 +15,6 @@ from vertiwm_jax.models import files
 from vertiwm_jax.models.registry import load_fitted
 from vertiwm_jax.precision import float32
 from vertiwm_jax.runs import Run
-from vertiwm_jax.training import keep_compiled
 from vertiwm_jax.world_model.verti_wm import VertiWMParams
 
 _log = logging.getLogger(__name__)
@@ -38,8 +37,6 @@ class FitConfig(PipelineConfig):
     `model.vehicles` is any."""
     wandb: str | None = None
     """Project of Weights & Biases that gets the metrics too; needs the package `wandb`."""
-    compile_cache: Path | None = None
-    """Folder that keeps compiled programs for later runs."""
 
 
 def run(config: FitConfig) -> Path:
@@ -49,7 +46,6 @@ def run(config: FitConfig) -> Path:
     disk do not allow it, and `TrainingInterrupted` at Ctrl-C once all is saved.
     """
     Run.expect(config, config.wandb)
-    keep_compiled(config.compile_cache)
     start = started(config)
     for collection in pipeline.expect_drives(config):
         _log.info("%s", collection)

@@ -35,7 +35,7 @@ from vertiwm_jax.rl.sac import SAC, SACConfig
 from vertiwm_jax.rl.td3 import TD3, TD3Config
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain.map import TerrainMap, expect_room
-from vertiwm_jax.training import LoopConfig, Seeds, Work, keep_compiled
+from vertiwm_jax.training import LoopConfig, Seeds, Work
 
 Rows = dict[str, Policy | Agent]
 """Policies by their names in tables."""
@@ -49,6 +49,7 @@ class TaskConfig:
     GONE: ClassVar[dict[str, str]] = {
         "worlds": "is now terrain",
         "operands": "is now compute_dtype",
+        "compile_cache": "is now JAX_COMPILATION_CACHE_DIR in the environment",
     }
 
     seed: CountOrZero = 0
@@ -129,8 +130,6 @@ class TrainConfig(TaskConfig):
     """Folder of an earlier run to go on with; what is set beside changes its configuration."""
     wandb: str | None = None
     """Project of Weights & Biases that gets the metrics too; needs the package `wandb`."""
-    compile_cache: Path | None = None
-    """Folder that keeps compiled programs for later runs."""
     action_repeat: Count = 8
     """Steps of 0.1 s that an action is held while learning."""
     base: Base = "look ahead"
@@ -253,8 +252,15 @@ def environment(
 ) -> tuple[NavigationEnv, TaskParams]:
     """Tasks inside one of the models; weights that cannot be read raise `CheckpointError`."""
     moves, params = dynamics(config, model)
-    env = NavigationEnv(moves, config.navigation, variation)
+    env = _moved_by(moves, config, model, variation)
     return env, env.make_params(params, terrain, pool, config.driven.vehicle, encoders(config))
+
+
+def _moved_by(
+    moves: Dynamics, config: TaskConfig, model: ModelName, variation: RandomizationConfig
+) -> NavigationEnv:
+    settling = None if model == "builtin" else config.simulator
+    return NavigationEnv(moves, config.navigation, variation, settling=settling)
 
 
 def dynamics(
@@ -298,7 +304,6 @@ def run(
     the disk do not allow it, and `TrainingInterrupted` at Ctrl-C once all is saved.
     """
     Run.expect(config, config.wandb)
-    keep_compiled(config.compile_cache)
     # So that it goes on as it began, and is tested, from wherever that is.
     weights = config.weights and files.find(config.weights)
     paths = {"terrain": config.terrain, "weights": weights}
@@ -308,7 +313,7 @@ def run(
     _log.info("drawing worlds ...")
     terrain, pool, held_out = training_ground(config, worlds)
     machine.forget_programs()
-    env = NavigationEnv(moves, config.navigation, config.variation)
+    env = _moved_by(moves, config, config.model, config.variation)
     given = weights, terrain, pool, config.driven.vehicle, encoders(config)
     shapes = env.make_params(*given, settled=False)
     algorithm = config.algorithm(env)
