@@ -14,6 +14,7 @@ from benchmarks._harness import cell
 from vertiwm_jax import atomic
 
 _APART = {
+    "bogged",
     "gpu",
     "identification",
     "measured_wheels",
@@ -23,7 +24,7 @@ _APART = {
     "turns",
     "unseen_vehicles",
 }
-"""Those that need a GPU, recorded drives, trials or minutes; and what runs another one."""
+"""Those that need a GPU, recorded drives, trials or minutes, and what runs another one."""
 _NEEDS = {
     "chrono": ("pychrono", "see docs/collect.md"),
     "torch_peer": ("torch", 'pip install -e ".[peers]"'),

@@ -22,7 +22,7 @@ def command(terrain, goal):
     at_rest = VehicleState(jnp.array([0.0, 0.0, 0.47]), *jnp.zeros((3, 3)))
     routes = route.straight(CONFIG.route, terrain, goal[None, :2])
     return load_vehicle().command(
-        POLICY(observe(terrain, load_vehicle(), at_rest, goal, routes, jnp.zeros(2))),
+        POLICY(observe(terrain, load_vehicle(), at_rest, goal, routes, jnp.zeros(2), jnp.zeros(2))),
         CONFIG.speed_range,
     )
 
@@ -67,3 +67,21 @@ def test_it_steers_away_from_rough_ground(side, height):
     assert -side * steering > 0.05
     mirrored = ground(lambda x, y: height(x, -side * y))
     assert float(command(mirrored, AHEAD).steering) == pytest.approx(-steering, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("waiting", "backs_up"),
+    [((0.0, 0.0), False), ((0.9, 0.0), False), ((1.0, 0.0), True), ((9.0, 0.0), True)]
+    + [((0.0, 0.1), True), ((3.0, 1.4), True), ((0.0, 1.5), False), ((9.0, 1.5), False)],
+)
+def test_where_it_stalls_it_backs_up_for_a_run_up(waiting, backs_up):
+    at_rest = VehicleState(jnp.array([0.0, 0.0, 0.47]), *jnp.zeros((3, 3)))
+    routes = route.straight(CONFIG.route, FLAT, AHEAD[None, :2])
+    given = load_vehicle(), at_rest, AHEAD, routes, jnp.zeros(2), jnp.array(waiting)
+    seen = observe(FLAT, *given)
+    config = NavigationConfig(speed_range=(-3.0, 5.0))
+    chosen = load_vehicle().command(LookAhead(config)(seen), config.speed_range)
+    assert float(chosen.speed) == pytest.approx(-3.0 if backs_up else POLICY.speed, rel=1e-5)
+    assert not backs_up or float(chosen.steering) == 0
+    forwards = load_vehicle().command(POLICY(seen), CONFIG.speed_range)
+    assert float(forwards.speed) == pytest.approx(POLICY.speed, rel=1e-5)

@@ -11,7 +11,7 @@ from flax import struct
 
 from vertiwm_jax import parallel
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.env.observation import OBSERVATION_SIZE, WAITING, WAITING_SCALE
 from vertiwm_jax.env.reward import RewardConfig
 from vertiwm_jax.env.suites import circle_tasks
 from vertiwm_jax.env.task import NavigationConfig
@@ -79,6 +79,21 @@ def test_every_fault_ends_the_task(script, ending):
     outputs = play(script, 2, BLOCKED if ending == "COLLIDED" else OPEN)
     assert endings(outputs) == ["RUNNING", ending]
     assert [(o[3], o[4]) for o in outputs] == [(False, False), (True, False)]
+
+
+def test_how_long_it_stalls_and_backs_up_is_counted():
+    env, params = bicycle_env(
+        ground(), task((0.0, 0.0), (30.0, 0.0)), NavigationConfig(speed_range=(-3.0, 5.0))
+    )
+    step, (_, state) = jax.jit(env.step_env), env.start(params, jnp.int32(0))
+    counted = []
+    for speed in (0.0, 0.0, -3.0, -3.0, 4.0):
+        action = jnp.array([(speed + 3) / 4 - 1, 0.0])
+        seen, state, *_ = step(jax.random.key(0), state, action, params)
+        counted.append((int(state.stalled), int(state.backing)))
+        np.testing.assert_allclose(seen[WAITING] * WAITING_SCALE, np.array(counted[-1]) / 10)
+    assert [backing for _, backing in counted] == [0, 0, 1, 2, 0]
+    assert [stalled for stalled, _ in counted][:2] == [1, 2] and counted[3][0] == 0
 
 
 def test_a_diverged_state_never_leaves():

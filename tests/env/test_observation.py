@@ -22,7 +22,8 @@ CLASSES = slice(observation.GROUND.stop, None)
 def observe(terrain, vehicle, goal, action):
     """What is seen where the way to the goal is straight."""
     routes = route.straight(ROUTE, terrain, goal[None, :2])
-    return observation.observe(terrain, HMMWV, vehicle, goal, routes, action)
+    waiting = jnp.array([1.5, 0.5])
+    return observation.observe(terrain, HMMWV, vehicle, goal, routes, action, waiting)
 
 
 def vehicle(x, y, yaw):
@@ -49,6 +50,7 @@ def test_layout_and_units():
     np.testing.assert_allclose(seen[:8], motion, rtol=1e-6)
     np.testing.assert_allclose(seen[observation.GOAL], [0.4, 1.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(seen[11:13], action)
+    np.testing.assert_allclose(seen[observation.WAITING], [0.3, 0.1], rtol=1e-6)
 
     layout = observation.ObservationSpec().parts
     assert observation.ObservationSpec().size == len(seen)
@@ -61,6 +63,7 @@ def test_layout_and_units():
     assert named["goal distance"] == pytest.approx([20.0])
     assert named["goal bearing"] == pytest.approx([1.0, 0.0], abs=1e-6)
     assert named["last action"] == pytest.approx([0.5, -0.25])
+    assert named["stalled"] == pytest.approx([1.5]) and named["backing"] == pytest.approx([0.5])
     ahead = observation.arcs_ahead(jnp.asarray(seen))
     for name, found in zip(
         ("height", "crown", "rise", "bank", "twist", "route"), ahead, strict=True

@@ -136,7 +136,7 @@ def test_all_forms_of_a_policy_agree(actor, base, tmp_path):
 
 def test_observations_that_are_none_are_named(tmp_path):
     _, in_numpy = written(policy_of(ACTORS["ppo"], "none"), tmp_path)
-    with pytest.raises(ValueError, match=r"expected \[\.\.\., 475\], found \(7,\)"):
+    with pytest.raises(ValueError, match=r"expected \[\.\.\., 477\], found \(7,\)"):
         in_numpy(np.zeros(7))
     with pytest.raises(ValueError, match="expected finite numbers"):
         in_numpy(np.full(OBSERVATION_SIZE, np.nan))
@@ -179,6 +179,7 @@ def test_the_observation_of_map_arrays(size, sighted):
     arrays = (terrain.elevation, terrain.semantic, terrain.friction, terrain.obstacles)
     state = VehicleState.from_vector(jnp.array([15, 1, 2, 0.1, -0.2, 0.7, 3, 0, 0, 0, 0, 0.1]))
     goal, action = jnp.array([20.0, 5.0, 1.0]), jnp.array([0.3, -0.4])
+    waiting = jnp.array([1.5, 0.0])
     encoders, config = load_encoders() if sighted else None, NavigationConfig()
     observe, find_way, find_none = (
         jax.export.deserialize(bytearray(data)).call
@@ -198,12 +199,12 @@ def test_the_observation_of_map_arrays(size, sighted):
     assert (way >= straight.cost[0] - 1e-3).all() and (way > 1.5 * straight.cost[0]).any()
     latents = jax.jit(embed)(encoders, terrain, state) if encoders else None
     expected = jax.jit(observation.observe)(
-        terrain, load_vehicle(), state, goal, routes, action, latents
+        terrain, load_vehicle(), state, goal, routes, action, waiting, latents
     )
     assert 0 < (observation.arcs_ahead(expected)[1] == 7.5).sum() < 72
     if encoders:
         assert float(jnp.std(expected[OBSERVATION_SIZE:])) > 0.1
-    found = observe(*arrays, way, state.vector, goal, action)
+    found = observe(*arrays, way, state.vector, goal, action, waiting)
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 

@@ -129,7 +129,16 @@ def _look_ahead(about: About, observation: np.ndarray) -> np.ndarray:
     left = meters * np.sum(route[:, :, first:end], axis=2)
     share = _softmax(-(cost + base["onward"] * left) / base["spread"], axis=1)
     limit, steering = about["action"]["steering_limit"], _float32(about["arcs"]["steering"])
-    return _action(about, limit * np.sum(share * steering, axis=1))
+    ahead = _action(about, limit * np.sum(share * steering, axis=1))
+    if about["action"]["speed_range"][0] >= 0:
+        return ahead
+    # Where the vehicle has stalled, it backs up straight; both are whole steps of 0.1 s.
+    scale, back = about["observation"]["parts"]["stalled"]["scale"], _float32([-1, 0])
+    stalled = scale * _part(about, observation, "stalled")
+    backing = scale * _part(about, observation, "backing")
+    begins = np.where(stalled < base["patience"] - 0.05, ahead, back)
+    goes_on = np.where(backing < base["run_up"] - 0.05, back, ahead)
+    return np.where(backing < 0.05, begins, goes_on)
 
 
 def _straight_to_goal(about: About, observation: np.ndarray) -> np.ndarray:

@@ -46,7 +46,8 @@ def observe(config: NavigationConfig, vehicle: Vehicle, encoders: Encoders | Non
 
     With encoders, the observation ends with their latents of the ground.
     """
-    seen = _floats(config.route.cells, config.route.cells), _floats(12), _floats(3), _floats(2)
+    way = _floats(config.route.cells, config.route.cells)
+    seen = way, _floats(12), _floats(3), _floats(2), _floats(2)
     return _serialized(partial(_observe, vehicle, encoders), *_map_arrays(), *seen)
 
 
@@ -57,16 +58,17 @@ def _route(config: NavigationConfig, vehicle: Vehicle, *arguments: jax.Array) ->
 
 
 def _observe(driven: Vehicle, encoders: Encoders | None, *arguments: jax.Array) -> jax.Array:
-    """`[O]` the observation; the arguments are those of `_terrain`, then four more.
+    """`[O]` the observation; the arguments are those of `_terrain`, then five more.
 
     route: `[n, n]`, of `_route`. state: `[12]`, as `VehicleState.vector`. goal: `[3]` m. action:
-    `[2]`, the last one.
+    `[2]`, the last one. waiting: `[2]` s, for how long the vehicle has been slower than 0.3 m/s,
+    and been told to drive backwards, without a break.
     """
-    *arrays, cost, state, goal, action = arguments
+    *arrays, cost, state, goal, action, waiting = arguments
     terrain, vehicle = _terrain(*arrays), VehicleState.from_vector(state)
     route = Routes(cost[None], jnp.int32(0))
     latents = embed(encoders, terrain, vehicle) if encoders else None
-    return observation.observe(terrain, driven, vehicle, goal, route, action, latents)
+    return observation.observe(terrain, driven, vehicle, goal, route, action, waiting, latents)
 
 
 def _terrain(*arrays: jax.Array) -> TerrainMap:

@@ -6,7 +6,15 @@ import numpy as np
 from flax import struct
 
 from vertiwm_jax.env.agent import Policy
-from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, GOAL, ROUTE_SCALE, arcs_ahead
+from vertiwm_jax.env.observation import (
+    ARC_STATIONS,
+    ARC_STEERING,
+    GOAL,
+    ROUTE_SCALE,
+    WAITING,
+    WAITING_SCALE,
+    arcs_ahead,
+)
 from vertiwm_jax.env.route import TraversabilityCost
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import Vehicle, load_vehicle
@@ -53,10 +61,12 @@ class LookAhead:
     """Holds one speed and steers along arcs that stay level and lead to the goal.
 
     The cost of an arc is the difficulty of its ground, near places first, plus the cost to go from
-    its far places. The steering is the mean over arcs with weights exp(-cost / spread).
+    its far places. The steering is the mean over arcs with weights exp(-cost / spread). Where the
+    vehicle may reverse and has stalled, it backs up straight, as fast as it may, for a run-up.
 
     config: of the environment. speed: m/s. reach: wheelbases over which places lose weight.
     onward: weight of each meter of cost to go. far: stations whose cost to go is used.
+    patience: seconds stalled before it backs up; run_up: seconds for which it does.
     """
 
     config: NavigationConfig = struct.field(pytree_node=False)
@@ -66,6 +76,8 @@ class LookAhead:
     onward: float = struct.field(pytree_node=False, default=0.15)
     far: tuple[int, int] = struct.field(pytree_node=False, default=(5, 7))
     spread: float = struct.field(pytree_node=False, default=0.4)
+    patience: float = struct.field(pytree_node=False, default=1.0)
+    run_up: float = struct.field(pytree_node=False, default=1.5)
 
     @float32
     def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
@@ -75,7 +87,14 @@ class LookAhead:
         cost = jnp.sum(hard * np.exp(-ARC_STATIONS / self.reach), axis=-1)
         left = ROUTE_SCALE * jnp.mean(route[..., slice(*self.far)], axis=-1)
         share = jax.nn.softmax(-(cost + self.onward * left) / self.spread, axis=-1)
-        return _at_speed(self.config, self.speed, jnp.sum(share * ARC_STEERING, axis=-1))
+        ahead = _at_speed(self.config, self.speed, jnp.sum(share * ARC_STEERING, axis=-1))
+        if self.config.speed_range[0] >= 0:
+            return ahead
+        stalled, backing = jnp.moveaxis(observation[..., WAITING], -1, 0) * WAITING_SCALE
+        # Both are whole steps of 0.1 s.
+        begins = (backing < 0.05) & (stalled > self.patience - 0.05)
+        goes_on = (backing > 0.05) & (backing < self.run_up - 0.05)
+        return jnp.where((begins | goes_on)[..., None], jnp.array([-1.0, 0.0]), ahead)
 
 
 @struct.dataclass

@@ -197,6 +197,8 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         speed = jnp.linalg.norm(vehicle.velocity[:2])
         is_stalled = speed < config.stalled_speed
         stalled = jnp.where(is_stalled, state.stalled + running, 0)
+        held = params.vehicle.command(jnp.asarray(action), config.speed_range)
+        backing = jnp.where(held.speed < 0, state.backing + running, 0)
         time = jnp.int32(state.time) + running
         distance, _ = observation.distance_and_bearing(vehicle.position, state.goal)
         (roll, pitch, yaw), xy = vehicle.rpy, vehicle.position[:2]
@@ -240,6 +242,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
             action=action,
             time=time,
             stalled=stalled,
+            backing=backing,
             ending=ending,
             variation=variation,
             observed=observed,
@@ -275,7 +278,8 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
                         "see by, found neither; see models.registry.load_encoders"
                     )
                 latents = embed(params.encoders, terrain, state.vehicle)
-        seen = state.vehicle, state.goal, params.routes.select(state.route), state.action
+        waiting = STEP_SECONDS * jnp.stack([state.stalled, state.backing]).astype(jnp.float32)
+        seen = state.vehicle, state.goal, params.routes.select(state.route), state.action, waiting
         return observation.observe(terrain, params.vehicle, *seen, latents)
 
     def is_terminated(self, state: TaskState, params: TaskParams) -> jax.Array:
@@ -344,6 +348,7 @@ def _settle(
             route=number,
             action=action,
             stalled=zero,
+            backing=zero,
             ending=zero,
             variation=DomainRandomization.draw(env.variation, jax.random.key(0), action),
             observed=seen,

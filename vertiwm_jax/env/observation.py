@@ -33,11 +33,14 @@ _DISTANCE_SCALE = 50.0  # m
 _HEIGHT_SCALE = 2.0  # m
 ROUTE_SCALE = 10.0  # m
 _SINKAGE_SCALE = 0.1  # m
+WAITING_SCALE = 5.0  # s
 _WALL = 1.5  # m, crown that stands for obstacles and the edge of the map
 
 GOAL = slice(8, 11)
 """Place of the distance over 50 m and of the cosine and sine of the bearing."""
-GROUND = slice(13, 13 + 6 * _POSES)
+WAITING = slice(13, 15)
+"""Place of the seconds stalled, and of those told to drive backwards, over `WAITING_SCALE`."""
+GROUND = slice(15, 15 + 6 * _POSES)
 """Place of height, crown, rise, bank, twist and route, each of all places."""
 OBSERVATION_SIZE = GROUND.stop + 2 * CLASS_PLACES.size
 OBSERVATION_LIMIT = 10.0
@@ -66,6 +69,8 @@ LAYOUT = {
     "goal distance": Part(slice(8, 9), "m", _DISTANCE_SCALE),
     "goal bearing": Part(slice(9, 11), "cosine and sine", 1.0),
     "last action": Part(slice(11, 13), "speed and steering in [-1, 1]", 1.0),
+    "stalled": Part(slice(13, 14), "s", WAITING_SCALE),
+    "backing": Part(slice(14, 15), "s", WAITING_SCALE),
     "height": _of_places(0, "m", _HEIGHT_SCALE),
     "crown": _of_places(1, "m", route.CROWN_SCALE),
     "rise": _of_places(2, "m/m", route.SLOPE_SCALE),
@@ -163,20 +168,23 @@ def observe(
     goal: jax.Array,
     routes: Routes,
     action: jax.Array,
+    waiting: jax.Array,
     embedding: jax.Array | None = None,
 ) -> jax.Array:
     """`[O]` float32 seen by one vehicle on the selected world, in the parts of `ObservationSpec`.
 
     In order: roll, pitch; v_body; omega_body; distance to the goal, cosine and sine of its
-    bearing; the last action; what the ground would do to the vehicle here and at places on nine
+    bearing; the last action; for how long the vehicle has stalled, and been told to drive
+    backwards, without a break; what the ground would do to the vehicle here and at places on nine
     arcs up to six wheelbases long (mean height under the wheels against now; crown between them,
     which the belly meets, and a wall where an obstacle or the edge of the map would be hit; rise;
     bank; twist, which lifts wheels; route, by how much more the way to the goal costs from there
     than from here, and here by how much more than its distance); friction and plate sinkage at
     some of the places, -1 off the map.
 
-    goal: `[3]` m; routes: to it; action: `[2]` in [-1, 1]; embedding: `EMBEDDING_SHAPE`, the ground
-    as encoders see it, which follows all else tile by tile, the order in which networks read it.
+    goal: `[3]` m; routes: to it; action: `[2]` in [-1, 1]; waiting: `[2]` s, stalled and backing;
+    embedding: `EMBEDDING_SHAPE`, the ground as encoders see it, which follows all else tile by
+    tile, the order in which networks read it.
     """
     yaw = state.rpy[2]
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
@@ -189,6 +197,7 @@ def observe(
         distance[None] / _DISTANCE_SCALE,
         jnp.stack([cos * east + sin * north, cos * north - sin * east]),
         action,
+        waiting / WAITING_SCALE,
     )
 
     # Written out: a matmul may round map coordinates to ten bits on an accelerator.

@@ -81,7 +81,8 @@ class TaskState(environment.EnvState):
     vehicle, history: the model's.
     world: `[]` int32; goal: `[3]` m; route: `[]` int32, which of all routes leads there.
     action: `[2]` the last one, in [-1, 1].
-    time: `[]` int32 steps done; stalled: `[]` int32 steps stalled without a break.
+    time: `[]` int32 steps done; stalled, backing: `[]` int32 steps stalled, and told to drive
+        backwards, without a break.
     ending: `[]` int32 `TerminationReason` code.
     variation: how this episode differs from what the map says.
     observed: what the vehicle has seen of its world; None where it knows all of the map.
@@ -94,6 +95,7 @@ class TaskState(environment.EnvState):
     route: jax.Array
     action: jax.Array
     stalled: jax.Array
+    backing: jax.Array
     ending: jax.Array
     variation: DomainRandomization
     observed: ObservedMap | None = None

@@ -209,7 +209,9 @@ def load_policy(folder: str | Path, seed: int = 0) -> Policy:
     with refused, np.load(file, allow_pickle=False) as stored:
         arrays = {name: jnp.asarray(stored[name][seed]) for name in stored.files}
     actor, critic = config.networks
-    like = jax.eval_shape(partial(_untrained, actor, critic), arrays["observation_mean"])
+    # Policies of other versions of this package may have seen something else.
+    seen = jax.ShapeDtypeStruct((config.navigation.observed.size,), jnp.float32)
+    like = jax.eval_shape(partial(_untrained, actor, critic), seen)
     names = named_leaves(like)
     for name, leaf in names.items():
         found = arrays[name].shape if name in arrays else "none"
@@ -227,7 +229,7 @@ def load_policy(folder: str | Path, seed: int = 0) -> Policy:
 def _untrained(
     actor: Actor | TanhNormalActor, critic: Critic, observation: jax.Array
 ) -> dict[str, Any]:
-    """Weights of the shapes that were stored."""
+    """Weights for observations of this shape."""
     key = jax.random.key(0)
     if isinstance(actor, Actor):
         critics = critic.init(key, observation)

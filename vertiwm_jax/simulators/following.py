@@ -86,7 +86,7 @@ class AgentPilot:
     def _from_goal_to_goal(self, now: Now, draw: Callable[[np.ndarray], np.ndarray]) -> Now:
         """The same, as if the episode had begun here, with another goal where one is reached."""
         zero, config = jnp.int32(0), self.env.config
-        state = replace(now.state, ending=zero, stalled=zero, time=zero)
+        state = replace(now.state, ending=zero, stalled=zero, backing=zero, time=zero)
         place = np.asarray(state.vehicle.position)
         if np.linalg.norm(state.goal - place) >= config.goal_radius:
             return replace(now, state=state)
