@@ -178,6 +178,8 @@ class PPOTraining(TrainConfig):
 
     name: ClassVar[str] = "ppo"
     kind: ClassVar[type[PolicyAlgorithm[Any]]] = PPO
+    navigation: NavigationConfig = NavigationConfig(speed_range=(-3.0, 5.0))
+    """What the task is; the vehicle may back up where it is stuck."""
     ppo: PPOConfig = PPOConfig()
     """The algorithm."""
 
