@@ -11,7 +11,6 @@ import jax
 from benchmarks._harness import parser, report
 from vertiwm_jax import config as configuration
 from vertiwm_jax import machine, parallel, training
-from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
 from vertiwm_jax.training import Seeds
@@ -39,7 +38,7 @@ def main() -> None:
     terrain, pool, _ = experiment.training_ground(config)
     machine.forget_programs()
     dynamics, weights = experiment.dynamics(config, config.model)
-    env = NavigationEnv(dynamics, config.navigation, config.variation)
+    env = experiment.env_of(config, config.model, dynamics, config.variation)
     algorithm = Seeds(config.algorithm(env), config.loop.seeds)
     encoders = experiment.encoders(config)
     shapes = env.make_params(weights, terrain, pool, encoders=encoders, settled=False)

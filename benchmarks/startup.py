@@ -42,7 +42,6 @@ def phases(name: str) -> dict[str, dict[str, float]]:
     jax.monitoring.register_event_duration_secs_listener(note)
     from vertiwm_jax import config as configuration
     from vertiwm_jax import machine, parallel, training, xla
-    from vertiwm_jax.env.navigation import NavigationEnv
     from vertiwm_jax.rl import experiment
     from vertiwm_jax.rl.experiment import PPOTraining
     from vertiwm_jax.training import Seeds
@@ -54,7 +53,7 @@ def phases(name: str) -> dict[str, dict[str, float]]:
     machine.forget_programs()
     lap("worlds")
     dynamics, weights = experiment.dynamics(config, config.model)
-    env = NavigationEnv(dynamics, config.navigation, config.variation, settling=config.simulator)
+    env = experiment.env_of(config, config.model, dynamics, config.variation)
     algorithm = Seeds(config.algorithm(env), config.loop.seeds)
     encoders = experiment.encoders(config)
     shapes = env.make_params(weights, terrain, pool, encoders=encoders, settled=False)

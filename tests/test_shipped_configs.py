@@ -46,3 +46,11 @@ def test_the_papers_schedule_is_the_papers():
     training = config.load(PPOTraining, config.default_config("ppo_paper"))
     assert training.ppo.total_timesteps == 2_000 * 20 * 300
     assert training.action_repeat == 1 and training.base == "none"
+
+
+@pytest.mark.parametrize("kind", [PPOTraining, FitConfig, CompareConfig])
+def test_a_setting_that_is_gone_says_what_is_in_its_place(kind, tmp_path):
+    file = tmp_path / "before.yaml"
+    file.write_text("compile_cache: null\n")
+    with pytest.raises(config.ConfigError, match="compile_cache: is now JAX_COMPILATION_CACHE_DIR"):
+        config.load(kind, file)

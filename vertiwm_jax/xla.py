@@ -22,6 +22,8 @@ _BRIEF = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": Fa
 _READ_FLAGS = "from jaxlib import xla_client; xla_client.CompileOptions()"
 _CPU = ("vendor_id", "cpu family", "model", "model name", "flags", "Features")
 _KEPT = 1 << 30  # bytes
+GONE = {"compile_cache": "is now JAX_COMPILATION_CACHE_DIR in the environment"}
+"""A setting that configurations had, and what is in its place."""
 _left_out: set[str] = set()
 
 
@@ -70,7 +72,7 @@ def keep_compiled() -> None:
     They lie where JAX was told (`JAX_COMPILATION_CACHE_DIR`), or in the user's folder of caches, in
     one for this kind of CPU. `JAX_ENABLE_COMPILATION_CACHE=false` turns it off.
     """
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    if not jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
         kept = platformdirs.user_cache_path("vertiwm_jax") / f"programs-{cpu()}"
         jax.config.update("jax_compilation_cache_dir", str(kept))
     jax.config.update("jax_compilation_cache_max_size", _KEPT)

@@ -5,11 +5,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
-from vertiwm_jax import atomic
+from vertiwm_jax import atomic, xla
 from vertiwm_jax import config as configuration
 from vertiwm_jax import runs as run_folders
 from vertiwm_jax.config import AtLeastOne, ConfigError, Count, CountOrZero
@@ -43,6 +43,8 @@ class Row:
 @configuration.settings
 class CompareConfig:
     """Train policies by several algorithms in several models, and test them all alike."""
+
+    GONE: ClassVar[dict[str, str]] = xla.GONE
 
     rows: tyro.conf.Suppress[tyro.conf.Fixed[Annotated[tuple[Row, ...], AtLeastOne]]]
     """Which policies; in a file only."""

@@ -4,9 +4,10 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from vertiwm_jax import config as configuration
+from vertiwm_jax import xla
 from vertiwm_jax.config import ConfigError, settings
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.learning import pipeline
@@ -23,6 +24,8 @@ _log = logging.getLogger(__name__)
 @settings
 class FitConfig(PipelineConfig):
     """Fit Verti-WM to recorded drives: autoencoders, both specialists, the gate."""
+
+    GONE: ClassVar[dict[str, str]] = xla.GONE
 
     name: str = "fit"
     """What the name of the run folder begins with; the date follows."""

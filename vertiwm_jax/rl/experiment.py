@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal, cast
 import jax
 
 from vertiwm_jax import config as configuration
-from vertiwm_jax import machine, training
+from vertiwm_jax import machine, training, xla
 from vertiwm_jax.config import Count, CountOrZero
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import controllers, suites
@@ -49,7 +49,7 @@ class TaskConfig:
     GONE: ClassVar[dict[str, str]] = {
         "worlds": "is now terrain",
         "operands": "is now compute_dtype",
-        "compile_cache": "is now JAX_COMPILATION_CACHE_DIR in the environment",
+        **xla.GONE,
     }
 
     seed: CountOrZero = 0
@@ -254,13 +254,14 @@ def environment(
 ) -> tuple[NavigationEnv, TaskParams]:
     """Tasks inside one of the models; weights that cannot be read raise `CheckpointError`."""
     moves, params = dynamics(config, model)
-    env = _moved_by(moves, config, model, variation)
+    env = env_of(config, model, moves, variation)
     return env, env.make_params(params, terrain, pool, config.driven.vehicle, encoders(config))
 
 
-def _moved_by(
-    moves: Dynamics, config: TaskConfig, model: ModelName, variation: RandomizationConfig
+def env_of(
+    config: TaskConfig, model: ModelName, moves: Dynamics, variation: RandomizationConfig
 ) -> NavigationEnv:
+    """The tasks of `environment` without parameters, where the model has been loaded as `moves`."""
     settling = None if model == "builtin" else config.simulator
     return NavigationEnv(moves, config.navigation, variation, settling=settling)
 
@@ -315,7 +316,7 @@ def run(
     _log.info("drawing worlds ...")
     terrain, pool, held_out = training_ground(config, worlds)
     machine.forget_programs()
-    env = _moved_by(moves, config, config.model, config.variation)
+    env = env_of(config, config.model, moves, config.variation)
     given = weights, terrain, pool, config.driven.vehicle, encoders(config)
     shapes = env.make_params(*given, settled=False)
     algorithm = config.algorithm(env)
