@@ -243,19 +243,21 @@ def longest(bench: Benchmark) -> Found:
 
 
 def end_to_end(bench: Benchmark) -> Iterator[Case]:
-    """The default training, from its command to its table."""
-    yield "python -m vertiwm_jax.ppo", partial(trained, bench)
+    """The default training, from its command to its table, then again with the programs it kept."""
+    with tempfile.TemporaryDirectory() as kept:
+        yield "python -m vertiwm_jax.ppo", partial(trained, bench, Path(kept))
+        yield "with programs kept", partial(trained, bench, Path(kept))
 
 
-def trained(bench: Benchmark) -> Found:
-    """In a process of its own that finds nothing compiled before, and when it said what."""
+def trained(bench: Benchmark, kept: Path) -> Found:
+    """In a process of its own that keeps compiled programs in a folder, and when it said what."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "ppo.yaml"
         configuration.save(replace(bench.config, compute_dtype="auto", runs=Path(folder)), file)
         command = [sys.executable, "-m", "vertiwm_jax.ppo", "--config", str(file)]
         # This process has three quarters of the device's memory.
         given = os.environ | {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.2"}
-        given["JAX_COMPILATION_CACHE_DIR"] = folder
+        given["JAX_COMPILATION_CACHE_DIR"] = str(kept)
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
         start = time.monotonic()
         with subprocess.Popen(command, env=given, text=True, **pipes) as process:
