@@ -88,7 +88,7 @@ def training(config: TrainConfig) -> tuple[PolicyAlgorithm[Any], TaskParams]:
 
 def main() -> None:
     arguments = parser(__doc__)
-    arguments.add_argument("--configs", nargs="+", default=("ppo", "ppo_paper"))
+    arguments.add_argument("--configs", nargs="+", default=("ppo", "paper/ppo"))
     arguments.add_argument("--models", nargs="+", default=("builtin", "vertiwm"))
     arguments.add_argument("--size", choices=get_args(Size), default="base", help="of Verti-WM")
     arguments.add_argument(

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from vertiwm_jax import config
+from vertiwm_jax.evaluation import compare
 from vertiwm_jax.evaluation.compare import CompareConfig
 from vertiwm_jax.importers.settings import ImportSettings
 from vertiwm_jax.learning.experiment import FitConfig
@@ -14,7 +15,8 @@ from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
 
 FOLDER = Path(__file__).parents[1] / "configs"
-KINDS = {"table3": CompareConfig, "import_nedm": ImportSettings} | dict.fromkeys(
+KINDS = {"import_nedm": ImportSettings} | dict.fromkeys(["table3", "table3_paper"], CompareConfig)
+KINDS |= dict.fromkeys(
     ["fit_chrono", "fit_paper", "fine_tune", "gates", "adapt", "any_vehicle"], FitConfig
 )
 
@@ -42,10 +44,18 @@ def test_what_is_not_set_is_as_in_the_file_of_the_algorithm(name):
     assert experiment.load(config.default_config(name)) == experiment.TRAININGS[name]()
 
 
-def test_the_papers_schedule_is_the_papers():
-    training = config.load(PPOTraining, config.default_config("ppo_paper"))
-    assert training.ppo.total_timesteps == 2_000 * 20 * 300
-    assert training.action_repeat == 1 and training.base == "none"
+def test_the_papers_trainings_are_the_papers():
+    table = config.load(CompareConfig, config.default_config("table3_paper"))
+    assert table.rows[0].model == "vertiwm"
+    for row in table.rows:
+        training = compare.training(table, row)
+        task, schedule = training.navigation, training.schedule
+        assert schedule.total_timesteps == 2_000 * 20 * 300
+        assert (schedule.num_envs, schedule.num_steps) == (20, 300)
+        assert training.action_repeat == 1 and training.base == "none"
+        assert task.embeddings and not task.arcs and task.straight
+        before_and_after = 2 * 4 * task.observed.size * getattr(schedule, "buffer_size", 0)
+        assert before_and_after < 2e9  # bytes
 
 
 @pytest.mark.parametrize("kind", [PPOTraining, FitConfig, CompareConfig])

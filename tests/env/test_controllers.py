@@ -6,7 +6,7 @@ from env.worlds import GRASS
 
 from vertiwm_jax.env import route
 from vertiwm_jax.env.controllers import LookAhead
-from vertiwm_jax.env.observation import observe
+from vertiwm_jax.env.observation import ObservationSpec, observe
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.state import VehicleState
@@ -22,7 +22,18 @@ def command(terrain, goal):
     at_rest = VehicleState(jnp.array([0.0, 0.0, 0.47]), *jnp.zeros((3, 3)))
     routes = route.straight(CONFIG.route, terrain, goal[None, :2])
     return load_vehicle().command(
-        POLICY(observe(terrain, load_vehicle(), at_rest, goal, routes, jnp.zeros(2), jnp.zeros(2))),
+        POLICY(
+            observe(
+                ObservationSpec(),
+                terrain,
+                load_vehicle(),
+                at_rest,
+                goal,
+                routes,
+                jnp.zeros(2),
+                jnp.zeros(2),
+            )
+        ),
         CONFIG.speed_range,
     )
 
@@ -78,7 +89,7 @@ def test_where_it_stalls_it_backs_up_for_a_run_up(waiting, backs_up):
     at_rest = VehicleState(jnp.array([0.0, 0.0, 0.47]), *jnp.zeros((3, 3)))
     routes = route.straight(CONFIG.route, FLAT, AHEAD[None, :2])
     given = load_vehicle(), at_rest, AHEAD, routes, jnp.zeros(2), jnp.array(waiting)
-    seen = observe(FLAT, *given)
+    seen = observe(ObservationSpec(), FLAT, *given)
     config = NavigationConfig(speed_range=(-3.0, 5.0))
     chosen = load_vehicle().command(LookAhead(config)(seen), config.speed_range)
     assert float(chosen.speed) == pytest.approx(-3.0 if backs_up else POLICY.speed, rel=1e-5)

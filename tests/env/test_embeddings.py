@@ -11,20 +11,29 @@ from env.worlds import BICYCLE, SNOW, Scripted, hills, task
 
 from vertiwm_jax.checkpoints import CheckpointError
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.observation import OBSERVATION_LIMIT, OBSERVATION_SIZE
+from vertiwm_jax.env.observation import (
+    GROUND,
+    IMAGE_SHAPE,
+    OBSERVATION_LIMIT,
+    OBSERVATION_SIZE,
+)
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
 from vertiwm_jax.models import files
 from vertiwm_jax.models.config import ModelConfig
 from vertiwm_jax.models.registry import load_encoders, load_model
-from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
 
 CONFIG = NavigationConfig(speed_range=(0.0, 5.0), settle_steps=1, embeddings=True)
 BLIND = NavigationConfig(speed_range=(0.0, 5.0), settle_steps=1)
+
+
+def picture(numbers):
+    """Tiles as an image `[16, 16, 37]`."""
+    return np.asarray(numbers).reshape(4, 4, 4, 4, 37).swapaxes(1, 2).reshape(16, 16, 37)
 
 
 @pytest.fixture(scope="module")
@@ -52,14 +61,13 @@ def stepped(config, dynamics, params, terrain, encoders=None):
 def test_an_observation_ends_with_the_ground_as_the_encoders_see_it(name, terrain):
     moves = load_model(name, embeddings=True)
     env, seen, state = stepped(CONFIG, *moves, terrain, load_encoders())
-    assert seen.shape == (OBSERVATION_SIZE + 16 * 16 * 36,)
-    assert env.config.observed.layout.image == EMBEDDING_SHAPE
+    assert seen.shape == (OBSERVATION_SIZE + 16 * 16 * 37,)
+    assert env.config.observed.layout.image == IMAGE_SHAPE == (16, 16, 37)
     expected = jax.jit(embed)(files.load(files.PRETRAINED)[1].encoders[0], terrain, state.vehicle)
     assert float(jnp.std(expected)) > 0.1 and float(jnp.max(jnp.abs(expected))) < OBSERVATION_LIMIT
-    tiles = seen[OBSERVATION_SIZE:].reshape(4, 4, 4, 4, 36)
-    for row, column in np.ndindex(16, 16):
-        found = tiles[row // 4, column // 4, row % 4, column % 4]
-        np.testing.assert_allclose(found, expected[row, column], atol=1e-4)
+    found = picture(seen[OBSERVATION_SIZE:])
+    np.testing.assert_allclose(found[..., :-1], expected, atol=1e-4)
+    assert not found[..., -1].any()
 
 
 @pytest.mark.integration
@@ -69,6 +77,29 @@ def test_seeing_does_not_change_how_a_model_moves(terrain):
     _, blind, alone = stepped(BLIND, *moves, terrain)
     np.testing.assert_allclose(state.vehicle.vector, alone.vehicle.vector, atol=1e-5)
     np.testing.assert_allclose(seen[:OBSERVATION_SIZE], blind, atol=1e-5)
+
+
+def test_an_obstacle_and_the_edge_of_the_map_stand_in_the_picture(terrain):
+    """The last channel, in which the first row is farthest ahead and the first column left."""
+    box = np.array([[-45.0, 3.0, 1.8, 1.0, 1.0]], np.float32)
+    ground = TerrainMap.from_array(np.asarray(terrain.elevation[0]), obstacles=box)
+    config = replace(CONFIG, arcs=False)
+
+    def walls(x, y, yaw):
+        env = NavigationEnv(KinematicBicycle(), config)
+        pool = task((x, y), (20.0, 20.0), yaw=yaw)
+        seen = env.make_params(BICYCLE, ground, pool, encoders=load_encoders()).start_observation
+        return picture(seen[0, GROUND.start :])[..., -1]
+
+    # It is 4.1 to 5.9 m ahead and 1 m wide; cells are 0.8 m, from 6.4 m ahead and to the left on.
+    ahead = walls(-50.0, 3.0, 0.0)
+    expected = np.zeros((16, 16))
+    expected[0:3, 7:9] = 1
+    np.testing.assert_array_equal(ahead, expected)
+    # Of a vehicle that has turned to the left, it is on the right.
+    np.testing.assert_array_equal(walls(-50.0, 3.0, np.pi / 2), np.rot90(ahead, -1))
+    beyond = walls(float(ground.extent[0][0]) + 3.0, 3.0, 0.0)
+    assert beyond[12:].all() and not beyond[:12, 7:9].any()
 
 
 def test_what_is_seen_where_a_model_diverged_is_finite(terrain):

@@ -12,7 +12,7 @@ from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
 
 HMMWV = load_vehicle()
-ROUTE = RouteConfig()
+ROUTE, SPEC = RouteConfig(), observation.ObservationSpec()
 POSES = jax.tree.map(np.asarray, observation.poses_ahead(HMMWV))
 OBSTACLE = np.array([[9.0, 3.0, 4.0, 6.0, 2.0]], np.float32)
 CLASSES = slice(observation.GROUND.stop, None)
@@ -23,7 +23,7 @@ def observe(terrain, vehicle, goal, action):
     """What is seen where the way to the goal is straight."""
     routes = route.straight(ROUTE, terrain, goal[None, :2])
     waiting = jnp.array([1.5, 0.5])
-    return observation.observe(terrain, HMMWV, vehicle, goal, routes, action, waiting)
+    return observation.observe(SPEC, terrain, HMMWV, vehicle, goal, routes, action, waiting)
 
 
 def vehicle(x, y, yaw):

@@ -26,7 +26,7 @@ from vertiwm_jax.simulators.collection import CollectConfig
 
 pytestmark = pytest.mark.slow
 FILES = {
-    **{name: (TRAININGS["ppo"], name) for name in ("ppo", "ppo_small", "ppo_paper")},
+    **{name: (TRAININGS["ppo"], name) for name in ("ppo", "ppo_small", "paper/ppo")},
     **{name: (TRAININGS[name], name) for name in ("sac", "td3")},
     **{name: (FitConfig, name) for name in ("fit_chrono", "fit_paper", "fine_tune", "gates")},
     **{name: (FitConfig, name) for name in ("adapt", "any_vehicle")},

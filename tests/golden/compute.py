@@ -24,7 +24,7 @@ from rl.probes import ProbeParams, Target
 from vertiwm_jax import cli, runs
 from vertiwm_jax import config as configuration
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.env.observation import IMAGE_SHAPE, OBSERVATION_SIZE
 from vertiwm_jax.env.reward import RewardConfig
 from vertiwm_jax.env.suites import Tasks
 from vertiwm_jax.env.task import NavigationConfig
@@ -35,7 +35,6 @@ from vertiwm_jax.learning.stages import Inputs
 from vertiwm_jax.models import files
 from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
 from vertiwm_jax.networks.specialist import ComputeDtype
-from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.perception.perceive import perceive
 from vertiwm_jax.rl.ppo import PPO, PPOConfig
 from vertiwm_jax.rl.sac import SAC, SACConfig
@@ -184,11 +183,11 @@ def environment() -> Numbers:
     for _ in range(5):
         observation, states, reward, *_ = step(jax.random.key(0), states, actions, params)
         rewards.append(reward)
-    picture = observation[:, OBSERVATION_SIZE:].reshape(len(xy), -1, EMBEDDING_SHAPE[-1])
+    picture = observation[:, OBSERVATION_SIZE:].reshape(len(xy), -1, IMAGE_SHAPE[-1])
     return {
         "start": params.start_observation[:, :OBSERVATION_SIZE],
         "observation": observation[:, :OBSERVATION_SIZE],
-        "embedding": picture.mean(axis=1),
+        "embedding": picture[..., :-1].mean(axis=1),
         "reward": jnp.stack(rewards, axis=1),
     }
 

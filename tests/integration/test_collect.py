@@ -1,7 +1,6 @@
 """Recorded drives: the command, what it writes, and what is left when it is stopped."""
 
 import json
-import math
 from functools import partial
 
 import jax
@@ -11,14 +10,13 @@ import pytest
 from doors import door, refusal
 
 from vertiwm_jax import atomic
-from vertiwm_jax.env.observation import LAYOUT, OBSERVATION_SIZE
+from vertiwm_jax.env.observation import LAYOUT
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.learning import dataset, schema
 from vertiwm_jax.learning.dataset import WheelSignals
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.registry import load_encoders
-from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.simulators import chrono, collection, excitation
 from vertiwm_jax.simulators.protocol import Drive, Observation, SimulatorError, drive
 from vertiwm_jax.terrain import files, query
@@ -246,8 +244,7 @@ class Ahead:
 def test_a_policy_drives_from_goal_to_goal(maps, encoders):
     terrain = files.load_map(maps / "map_0.npz")
     config = NavigationConfig(speed_range=(0.0, 5.0), embeddings=encoders is not None)
-    size = OBSERVATION_SIZE + (math.prod(EMBEDDING_SHAPE) if encoders else 0)
-    policy = jax.tree_util.Partial(AtGoal(size))
+    policy = jax.tree_util.Partial(AtGoal(config.observed.size))
     rng = np.random.default_rng(0)
     learned = policy, config, encoders
     pilot = collection.to_goals(learned, load_vehicle(), terrain, (0.0, 0.0, 0.0), rng)

@@ -17,14 +17,13 @@ from doors import door, opened, refusal
 from vertiwm_jax import checkpoints, machine, runs
 from vertiwm_jax import config as configuration
 from vertiwm_jax.deploy import run_policy
-from vertiwm_jax.env.observation import OBSERVATION_SIZE
+from vertiwm_jax.env.observation import IMAGE_SHAPE, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.evaluation import report
 from vertiwm_jax.evaluation.report import NavigationTest
 from vertiwm_jax.models import files as model_files
 from vertiwm_jax.models.config import ModelConfig
 from vertiwm_jax.models.registry import load_model
-from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.planning.improvement import ImprovementConfig
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import PPOTraining
@@ -150,7 +149,7 @@ def test_other_algorithms_leave_the_same_and_resume(name, folder, tmp_path):
     assert all(name in rows for rows in found.values())
     door("export")([str(run)])
     robot = run_policy.load(run / "export")
-    assert robot(np.zeros(OBSERVATION_SIZE + math.prod(EMBEDDING_SHAPE))).shape == (2,)
+    assert robot(np.zeros(OBSERVATION_SIZE + math.prod(IMAGE_SHAPE))).shape == (2,)
 
 
 def test_what_is_set_beside_resume_is_kept(run, train, tmp_path):

@@ -4,6 +4,7 @@ import math
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +21,11 @@ from vertiwm_jax.deploy import export, onnx_graph, run_policy, stablehlo
 from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.controllers import LookAhead
 from vertiwm_jax.env.episodes import run_episodes
-from vertiwm_jax.env.observation import ARCS, OBSERVATION_LIMIT, OBSERVATION_SIZE
+from vertiwm_jax.env.observation import OBSERVATION_LIMIT, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.registry import load_encoders
-from vertiwm_jax.networks.policy import Actor, ObservationLayout, TanhNormalActor
-from vertiwm_jax.perception.features import EMBEDDING_SHAPE
+from vertiwm_jax.networks.policy import Actor, TanhNormalActor
 from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.rl.experiment import SACTraining
 from vertiwm_jax.rl.policy import DeterministicPolicy
@@ -35,11 +35,13 @@ from vertiwm_jax.terrain.map import TerrainMap
 from vertiwm_jax.terrain.sensing import SensingConfig
 
 CONFIG = NavigationConfig(speed_range=(-1.0, 5.0))
-ACTORS = {
-    "ppo": Actor(2, (8, 6, 5), -0.5, ObservationLayout(ARCS)),
-    "sac": TanhNormalActor(2, (8, 6), -0.5, ObservationLayout(ARCS)),
-    "td3": TanhNormalActor(2, (8,), None, ObservationLayout(ARCS)),
-    "embeddings": Actor(2, (8, 6), -0.5, ObservationLayout(ARCS, EMBEDDING_SHAPE)),
+SIGHTED = replace(CONFIG, embeddings=True)
+KINDS = {
+    "ppo": (CONFIG, partial(Actor, 2, (8, 6, 5), -0.5)),
+    "sac": (CONFIG, partial(TanhNormalActor, 2, (8, 6), -0.5)),
+    "td3": (CONFIG, partial(TanhNormalActor, 2, (8,), None)),
+    "embeddings": (SIGHTED, partial(Actor, 2, (8, 6), -0.5)),
+    "no arcs": (replace(SIGHTED, arcs=False), partial(Actor, 2, (8, 6), -0.5)),
 }
 TINY = """
 ground: {train_worlds: 2, suites: [easy], suite_worlds: 1, starts: 8, pairs: 1}
@@ -54,10 +56,10 @@ sac:
 """
 
 
-def policy_of(actor, base):
+def policy_of(kind, base):
     """A policy of random weights, whose actions are not all at their limits."""
-    rng = np.random.default_rng(0)
-    size = OBSERVATION_SIZE + math.prod(actor.layout.image or (0,))
+    task, make = KINDS[kind]
+    rng, actor, size = np.random.default_rng(0), make(task.observed.layout), task.observed.size
     shapes = jax.eval_shape(actor.init, jax.random.key(0), jnp.zeros(size))
 
     def drawn(leaf):
@@ -66,24 +68,23 @@ def policy_of(actor, base):
     mean, variance = jnp.float32(rng.uniform(size=(2, size)))
     statistics = RunningStatistics(mean, variance, jnp.float32(9))
     learned = DeterministicPolicy(actor, jax.tree.map(drawn, shapes), statistics)
-    return exportable(learned, base, CONFIG)
+    return exportable(learned, base, task)
 
 
-def observations(image=None):
-    """`[B, O]` 64 usual ones, any within the limit, and its corners; goals all about."""
+def observations(size=OBSERVATION_SIZE):
+    """`[B, size]` 64 usual ones, any within the limit, and its corners; goals all about."""
     rng = np.random.default_rng(0)
-    usual = rng.normal(0, 0.5, (64, OBSERVATION_SIZE))
+    usual = rng.normal(0, 0.5, (64, size))
     limit = OBSERVATION_LIMIT
-    anything = rng.uniform(-limit, limit, (32, OBSERVATION_SIZE))
-    corners = rng.choice([-limit, 0.0, limit], (32, OBSERVATION_SIZE))
-    same = np.full((3, OBSERVATION_SIZE), [[-limit], [0.0], [limit]])
+    anything = rng.uniform(-limit, limit, (32, size))
+    corners = rng.choice([-limit, 0.0, limit], (32, size))
+    same = np.full((3, size), [[-limit], [0.0], [limit]])
     seen = np.concatenate([usual, anything, corners, same])
     bearing = np.linspace(-np.pi, np.pi, len(seen))
     seen[:64, 9], seen[:64, 10] = np.cos(bearing[:64]), np.sin(bearing[:64])
     around = [[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0], [-1, 1e-7], [-1, -1e-7]]
     seen[-len(around) :, 9:11] = around
-    picture = rng.normal(size=(len(seen), math.prod(image or (0,))))
-    return np.concatenate([seen, picture], axis=1).astype(np.float32)
+    return seen.astype(np.float32)
 
 
 def in_onnx(model, seen):
@@ -106,11 +107,12 @@ def act(policy, seen):
 
 
 @pytest.mark.parametrize(
-    ("actor", "base"),
-    [(actor, "look ahead") for actor in ACTORS] + [("ppo", "straight to goal"), ("sac", "none")],
+    ("kind", "base"),
+    [(kind, "look ahead") for kind, (task, _) in KINDS.items() if task.arcs]
+    + [("ppo", "straight to goal"), ("sac", "none"), ("no arcs", "none")],
 )
-def test_all_forms_of_a_policy_agree(actor, base, tmp_path):
-    policy, seen = policy_of(ACTORS[actor], base), observations(ACTORS[actor].layout.image)
+def test_all_forms_of_a_policy_agree(kind, base, tmp_path):
+    policy, seen = policy_of(kind, base), observations(KINDS[kind][0].observed.size)
     made, in_numpy = written(policy, tmp_path)
     in_stablehlo = jax.export.deserialize(bytearray(made["policy.stablehlo"])).call
     expected = np.asarray(act(policy, seen))
@@ -135,7 +137,7 @@ def test_all_forms_of_a_policy_agree(actor, base, tmp_path):
 
 
 def test_observations_that_are_none_are_named(tmp_path):
-    _, in_numpy = written(policy_of(ACTORS["ppo"], "none"), tmp_path)
+    _, in_numpy = written(policy_of("ppo", "none"), tmp_path)
     with pytest.raises(ValueError, match=r"expected \[\.\.\., 477\], found \(7,\)"):
         in_numpy(np.zeros(7))
     with pytest.raises(ValueError, match="expected finite numbers"):
@@ -159,7 +161,7 @@ class Robot:
 
 
 def test_the_robot_drives_as_the_test_does(tmp_path):
-    policy = policy_of(ACTORS["ppo"], "look ahead")
+    policy = policy_of("ppo", "look ahead")
     terrain = TerrainMap.from_array(hills(), np.full((16, 16), SNOW))
     config = NavigationConfig(speed_range=CONFIG.speed_range, horizon_seconds=4.0)
     env, params = bicycle_env(terrain, task((-20.0, 0.0), (20.0, 5.0)), config)
@@ -170,8 +172,12 @@ def test_the_robot_drives_as_the_test_does(tmp_path):
     np.testing.assert_allclose(found.position, expected.position, atol=1e-3)
 
 
-@pytest.mark.parametrize(("size", "sighted"), [(129, False), (41, False), (129, True)])
-def test_the_observation_of_map_arrays(size, sighted):
+@pytest.mark.parametrize(
+    ("size", "config"),
+    [(129, CONFIG), (41, CONFIG), (129, SIGHTED), (129, KINDS["no arcs"][0])],
+    ids=["arcs", "small", "embeddings", "no arcs"],
+)
+def test_the_observation_of_map_arrays(size, config):
     semantic = np.full((16, 16), SNOW)
     semantic[:, 8:] = 0
     boxes = np.array([[18, 4, 2, 3, 1], [0, 0, 0, 0, 0]], np.float32)
@@ -180,12 +186,12 @@ def test_the_observation_of_map_arrays(size, sighted):
     state = VehicleState.from_vector(jnp.array([15, 1, 2, 0.1, -0.2, 0.7, 3, 0, 0, 0, 0, 0.1]))
     goal, action = jnp.array([20.0, 5.0, 1.0]), jnp.array([0.3, -0.4])
     waiting = jnp.array([1.5, 0.0])
-    encoders, config = load_encoders() if sighted else None, NavigationConfig()
+    encoders = load_encoders() if config.embeddings else None
     observe, find_way, find_none = (
         jax.export.deserialize(bytearray(data)).call
         for data in (
             stablehlo.observe(config, load_vehicle(), encoders),
-            stablehlo.route(config, load_vehicle()),
+            stablehlo.route(replace(config, arcs=True), load_vehicle()),
             stablehlo.route(NavigationConfig(sensing=SensingConfig(range=12.0)), load_vehicle()),
         )
     )
@@ -198,12 +204,14 @@ def test_the_observation_of_map_arrays(size, sighted):
     np.testing.assert_allclose(find_none(*arrays, goal), straight.cost[0], rtol=1e-6)
     assert (way >= straight.cost[0] - 1e-3).all() and (way > 1.5 * straight.cost[0]).any()
     latents = jax.jit(embed)(encoders, terrain, state) if encoders else None
-    expected = jax.jit(observation.observe)(
-        terrain, load_vehicle(), state, goal, routes, action, waiting, latents
+    expected = jax.jit(observation.observe, static_argnums=0)(
+        config.observed, terrain, load_vehicle(), state, goal, routes, action, waiting, latents
     )
-    assert 0 < (observation.arcs_ahead(expected)[1] == 7.5).sum() < 72
+    assert expected.shape == (config.observed.size,)
+    if config.arcs:
+        assert 0 < (observation.arcs_ahead(expected)[1] == 7.5).sum() < 72
     if encoders:
-        assert float(jnp.std(expected[OBSERVATION_SIZE:])) > 0.1
+        assert float(jnp.std(expected[-math.prod(observation.IMAGE_SHAPE) :])) > 0.1
     found = observe(*arrays, way, state.vector, goal, action, waiting)
     np.testing.assert_allclose(found, expected, atol=1e-5)
 

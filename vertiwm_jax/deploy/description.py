@@ -9,7 +9,8 @@ import numpy as np
 import vertiwm_jax
 from vertiwm_jax.checkpoints import named_leaves
 from vertiwm_jax.env import observation
-from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING, ObservationSpec
+from vertiwm_jax.env.observation import ARC_STATIONS, ARC_STEERING
+from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.networks.policy import TanhNormalActor
 from vertiwm_jax.rl import running_statistics
 from vertiwm_jax.rl.policy import Policy
@@ -22,10 +23,8 @@ _SIZES = "length", "width", "wheelbase", "track", "ride_height", "steering_limit
 def about(policy: Policy) -> dict[str, Any]:
     """The content of `policy.json`: what observations, actions and weights mean."""
     vehicle, speed_range = policy.config.vehicle.vehicle, policy.task.speed_range
-    places, heading = observation.poses_ahead(vehicle)
     still = Command(jnp.float32(0), jnp.float32(0))
-    image = policy.learned.actor.layout.image
-    seen = ObservationSpec(image=image is not None)
+    seen = policy.task.observed
     parts = {
         name: {"slice": part.where.indices(seen.size), "unit": part.unit, "scale": part.scale}
         for name, part in seen.parts.items()
@@ -38,18 +37,16 @@ def about(policy: Policy) -> dict[str, Any]:
             "size": seen.size,
             "limit": observation.OBSERVATION_LIMIT,
             "parts": parts,
-            "places": np.column_stack([places, heading]).tolist(),
-            "class_places": observation.CLASS_PLACES.tolist(),
         },
         "action": {
             "speed_range": speed_range,
             "steering_limit": float(vehicle.steering_limit),
             "standing": vehicle.action(still, speed_range).tolist(),
         },
-        "arcs": {"steering": ARC_STEERING.tolist(), "stations": ARC_STATIONS.tolist()},
+        "arcs": _arcs(vehicle) if seen.arcs else None,
         "network": {
             "normalised_limit": running_statistics.CLIP,
-            "embedding": image,
+            "embedding": seen.layout.image,
             "squashed": isinstance(policy.learned.actor, TanhNormalActor),
         },
         "base": policy.base and {"name": policy.config.base, **_numbers(policy.base)},
@@ -65,6 +62,17 @@ def weights(policy: Policy) -> dict[str, np.ndarray]:
     named.pop("log_std", None)  # Only exploration needs it.
     named |= {"mean": learned.observations.mean, "std": learned.observations.std}
     return {name: np.asarray(leaf, np.float32) for name, leaf in named.items()}
+
+
+def _arcs(vehicle: Vehicle) -> dict[str, Any]:
+    """Where the observation shows the ground ahead."""
+    places, heading = observation.poses_ahead(vehicle)
+    return {
+        "steering": ARC_STEERING.tolist(),
+        "stations": ARC_STATIONS.tolist(),
+        "places": np.column_stack([places, heading]).tolist(),
+        "class_places": observation.CLASS_PLACES.tolist(),
+    }
 
 
 def _numbers(base: Any) -> dict[str, Any]:

@@ -71,16 +71,33 @@ def act(about: About, weights: Weights, observation: np.ndarray) -> np.ndarray:
 
 
 def _learned(about: About, weights: Weights, observation: np.ndarray) -> np.ndarray:
-    """The learned network: attention over arcs of constant steering, then dense layers."""
+    """The learned network: attention over arcs, if it sees them, then dense layers."""
     limit = about["network"]["normalised_limit"]
     seen = np.clip((observation - weights["mean"]) / weights["std"], -limit, limit)
+    shown = [_compressed(about, weights, seen)] if about["network"]["embedding"] else []
+    if about["arcs"]:
+        features, steered = _attended(about, weights, seen, shown)
+    else:
+        features = np.concatenate([seen[:, : _slice(about, "backing").stop], *shown], axis=-1)
+        steered = _float32(0)
+    *hidden, (kernel, bias) = _layers(weights, "MLP_0")
+    for inner, inner_bias in hidden:
+        features = np.tanh(features @ inner + inner_bias)
+    # Further columns of some networks are standard deviations, which are not used here.
+    mean = features @ kernel[:, :2] + bias[:2] + steered * _float32([0, 1])
+    return np.tanh(mean) if about["network"]["squashed"] else mean
+
+
+def _attended(
+    about: About, weights: Weights, seen: np.ndarray, shown: list[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Features `[B, F]` after attention over arcs of constant steering, and the mean steering."""
     steering = _float32(about["arcs"]["steering"])[:, None]
     ground = ("height", "crown", "rise", "bank", "twist", "route")
 
     before, after = _slice(about, "height").start, _slice(about, "route").stop
     here = [_part(about, seen, name)[:, :1] for name in ground]
     classes = seen[:, after : _slice(about, "sinkage").stop]
-    shown = [_compressed(about, weights, seen)] if about["network"]["embedding"] else []
     rest = np.concatenate([seen[:, :before], *here, classes, *shown], axis=-1)
     arcs = np.concatenate([_arcs(about, seen, name) for name in ground], axis=-1)
 
@@ -90,15 +107,8 @@ def _learned(about: About, weights: Weights, observation: np.ndarray) -> np.ndar
     for kernel, bias in more:
         x = np.tanh(x @ kernel + bias)
     share = _softmax(x @ score + score_bias, axis=1)
-    steered = np.sum(share * steering, axis=1)
-
     features = np.concatenate([np.sum(share * x, axis=1), np.max(x, axis=1), rest], axis=-1)
-    *hidden, (kernel, bias) = _layers(weights, "MLP_0")
-    for inner, inner_bias in hidden:
-        features = np.tanh(features @ inner + inner_bias)
-    # Further columns of some networks are standard deviations, which are not used here.
-    mean = features @ kernel[:, :2] + bias[:2] + steered * _float32([0, 1])
-    return np.tanh(mean) if about["network"]["squashed"] else mean
+    return features, np.sum(share * steering, axis=1)
 
 
 def _compressed(about: About, weights: Weights, seen: np.ndarray) -> np.ndarray:

@@ -44,11 +44,11 @@ def route(config: NavigationConfig, vehicle: Vehicle) -> bytes:
 def observe(config: NavigationConfig, vehicle: Vehicle, encoders: Encoders | None) -> bytes:
     """Exports `observation.observe` on maps of any size, with the arguments of `_observe`.
 
-    With encoders, the observation ends with their latents of the ground.
+    encoders: by which it sees the ground, if it ends with that.
     """
     way = _floats(config.route.cells, config.route.cells)
     seen = way, _floats(12), _floats(3), _floats(2), _floats(2)
-    return _serialized(partial(_observe, vehicle, encoders), *_map_arrays(), *seen)
+    return _serialized(partial(_observe, config, vehicle, encoders), *_map_arrays(), *seen)
 
 
 def _route(config: NavigationConfig, vehicle: Vehicle, *arguments: jax.Array) -> jax.Array:
@@ -57,7 +57,9 @@ def _route(config: NavigationConfig, vehicle: Vehicle, *arguments: jax.Array) ->
     return config.route_to(_terrain(*arrays), vehicle, goal[:2]).cost[0]
 
 
-def _observe(driven: Vehicle, encoders: Encoders | None, *arguments: jax.Array) -> jax.Array:
+def _observe(
+    config: NavigationConfig, driven: Vehicle, encoders: Encoders | None, *arguments: jax.Array
+) -> jax.Array:
     """`[O]` the observation; the arguments are those of `_terrain`, then five more.
 
     route: `[n, n]`, of `_route`. state: `[12]`, as `VehicleState.vector`. goal: `[3]` m. action:
@@ -68,7 +70,8 @@ def _observe(driven: Vehicle, encoders: Encoders | None, *arguments: jax.Array) 
     terrain, vehicle = _terrain(*arrays), VehicleState.from_vector(state)
     route = Routes(cost[None], jnp.int32(0))
     latents = embed(encoders, terrain, vehicle) if encoders else None
-    return observation.observe(terrain, driven, vehicle, goal, route, action, waiting, latents)
+    seen = vehicle, goal, route, action, waiting, latents
+    return observation.observe(config.observed, terrain, driven, *seen)
 
 
 def _terrain(*arrays: jax.Array) -> TerrainMap:

@@ -25,9 +25,9 @@ REFERENCE = "straight to goal"
 
 
 def baselines(config: NavigationConfig, vehicle: Vehicle) -> dict[str, Policy]:
-    """The controllers, by their names in tables."""
-    return {
-        "look ahead": LookAhead(config),
+    """The controllers, by their names in tables; only *look ahead* needs the arcs ahead."""
+    arcs: dict[str, Policy] = {"look ahead": LookAhead(config)} if config.arcs else {}
+    return arcs | {
         REFERENCE: StraightToGoal(config, float(vehicle.steering_limit)),
         "random": RandomActions(),
     }

@@ -88,7 +88,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         patches.footprint_covered(reach, max(map(abs, config.speed_range)))
         sensing.check(config.sensing, terrain)
         validate(tasks, terrain, config.goal_radius, config.map_margin)
-        if config.sensing.partial or not settled:
+        if config.straight or not settled:
             routes = route.straight(config.route, terrain, tasks.goal)
         else:
             routes = route.plan(config.route, terrain, vehicle, tasks.world, tasks.goal)
@@ -280,7 +280,8 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
                 latents = embed(params.encoders, terrain, state.vehicle)
         waiting = STEP_SECONDS * jnp.stack([state.stalled, state.backing]).astype(jnp.float32)
         seen = state.vehicle, state.goal, params.routes.select(state.route), state.action, waiting
-        return observation.observe(terrain, params.vehicle, *seen, latents)
+        spec = self.config.observed
+        return observation.observe(spec, terrain, params.vehicle, *seen, latents)
 
     def is_terminated(self, state: TaskState, params: TaskParams) -> jax.Array:
         """Whether the task itself is over."""

@@ -18,8 +18,9 @@ from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.networks.policy import Candidates, ObservationLayout, tiles
 from vertiwm_jax.perception.features import EMBEDDING_SHAPE
 from vertiwm_jax.state import VehicleState
-from vertiwm_jax.terrain import obstacles, query
+from vertiwm_jax.terrain import obstacles, patches, query
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.obstacles import Side
 
 # Where the vehicle would stand on arcs of constant steering: as far as a choice made now reaches.
 ARC_STEERING = np.linspace(-1.0, 1.0, 9)  # of the front wheels' largest angle
@@ -43,6 +44,8 @@ WAITING = slice(13, 15)
 GROUND = slice(15, 15 + 6 * _POSES)
 """Place of height, crown, rise, bank, twist and route, each of all places."""
 OBSERVATION_SIZE = GROUND.stop + 2 * CLASS_PLACES.size
+IMAGE_SHAPE = (*EMBEDDING_SHAPE[:2], EMBEDDING_SHAPE[2] + 1)
+"""Of the ground as encoders see it, and of what must not be driven on, which they do not see."""
 OBSERVATION_LIMIT = 10.0
 """Entries are clipped to this absolute value."""
 
@@ -87,18 +90,21 @@ LAYOUT = {
 class ObservationSpec:
     """Which parts an observation has, static.
 
+    arcs: whether it shows the ground along arcs ahead.
     image: whether it ends with the ground as encoders see it.
     """
 
+    arcs: bool = True
     image: bool = False
 
     @property
     def parts(self) -> dict[str, Part]:
         """What an observation holds, by name, in order."""
-        if not self.image:
-            return LAYOUT
-        pixels = slice(OBSERVATION_SIZE, OBSERVATION_SIZE + math.prod(EMBEDDING_SHAPE))
-        return {**LAYOUT, "embedding": Part(pixels, "1", 1.0)}
+        end = OBSERVATION_SIZE if self.arcs else GROUND.start
+        parts = {name: part for name, part in LAYOUT.items() if part.where.start < end}
+        if self.image:
+            parts["embedding"] = Part(slice(end, end + math.prod(IMAGE_SHAPE)), "1", 1.0)
+        return parts
 
     @property
     def size(self) -> int:
@@ -108,7 +114,7 @@ class ObservationSpec:
     @property
     def layout(self) -> ObservationLayout:
         """How networks should read observations."""
-        return ObservationLayout(ARCS, EMBEDDING_SHAPE if self.image else None)
+        return ObservationLayout(ARCS if self.arcs else None, IMAGE_SHAPE if self.image else None)
 
 
 def distance_and_bearing(position: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -162,6 +168,7 @@ def poses_ahead(vehicle: Vehicle) -> tuple[jax.Array, jax.Array]:
 
 
 def observe(
+    spec: ObservationSpec,
     terrain: TerrainMap,
     vehicle: Vehicle,
     state: VehicleState,
@@ -175,22 +182,14 @@ def observe(
 
     In order: roll, pitch; v_body; omega_body; distance to the goal, cosine and sine of its
     bearing; the last action; for how long the vehicle has stalled, and been told to drive
-    backwards, without a break; what the ground would do to the vehicle here and at places on nine
-    arcs up to six wheelbases long (mean height under the wheels against now; crown between them,
-    which the belly meets, and a wall where an obstacle or the edge of the map would be hit; rise;
-    bank; twist, which lifts wheels; route, by how much more the way to the goal costs from there
-    than from here, and here by how much more than its distance); friction and plate sinkage at
-    some of the places, -1 off the map.
+    backwards, without a break; `ground_ahead`; `image`.
 
     goal: `[3]` m; routes: to it; action: `[2]` in [-1, 1]; waiting: `[2]` s, stalled and backing;
-    embedding: `EMBEDDING_SHAPE`, the ground as encoders see it, which follows all else tile by
-    tile, the order in which networks read it.
+    embedding: `EMBEDDING_SHAPE`, the ground as encoders see it, if the observation has that.
     """
-    yaw = state.rpy[2]
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-
+    cos, sin = jnp.cos(state.rpy[2]), jnp.sin(state.rpy[2])
     distance, (east, north) = distance_and_bearing(state.position, goal)
-    motion = (
+    parts = [
         state.rpy[:2] / _ANGLE_SCALE,
         state.velocity / _SPEED_SCALE,
         state.angular_velocity,
@@ -198,39 +197,77 @@ def observe(
         jnp.stack([cos * east + sin * north, cos * north - sin * east]),
         action,
         waiting / WAITING_SCALE,
-    )
+    ]
+    if spec.arcs:
+        parts += ground_ahead(terrain, vehicle, state, distance, routes)
+    if spec.image:
+        assert embedding is not None
+        parts.append(image(terrain, state, embedding))
+    return jnp.clip(jnp.concatenate(parts), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
-    # Written out: a matmul may round map coordinates to ten bits on an accelerator.
-    def at(points: jax.Array) -> jax.Array:
-        x, y = points[..., 0], points[..., 1]
-        east, north = state.position[:2]
-        return jnp.stack([east + (cos * x - sin * y), north + (sin * x + cos * y)], axis=-1)
 
-    place, heading = poses_ahead(vehicle)
-    xy = at(place)
-    under = footprint(vehicle, query.height(terrain, at(places(vehicle, place, heading))))
+def ground_ahead(
+    terrain: TerrainMap, vehicle: Vehicle, state: VehicleState, distance: jax.Array, routes: Routes
+) -> list[jax.Array]:
+    """What the ground would do to the vehicle here and at places on arcs up to six wheelbases long.
+
+    Mean height under the wheels against now; crown between them, which the belly meets, and a wall
+    where an obstacle or the edge of the map would be hit; rise; bank; twist, which lifts wheels;
+    route, by how much more the way to the goal costs from there than from here, and here by how
+    much more than its distance `[]`, m; friction and plate sinkage at some of the places, -1 off
+    the map.
+    """
+    yaw, (place, heading) = state.rpy[2], poses_ahead(vehicle)
+    xy = _at(state, place)
+    under = footprint(vehicle, query.height(terrain, _at(state, places(vehicle, place, heading))))
     size = vehicle.length + 2 * route.CLEARANCE, vehicle.width + 2 * route.CLEARANCE
-    blocked = obstacles.collides(terrain, xy, yaw + heading, *size)
-    # Heights repeat beyond the edge of the map, which would look like the best of roads.
-    blocked |= edge_distance(terrain, xy) < 0
     cost = routes.cost_to_go(terrain, xy)
-    ground = (
+
+    seen = _at(state, place[CLASS_PLACES])
+    below = query.surface(terrain, seen)
+    sinkage = plate_sinkage(terrain)[below.semantic] / _SINKAGE_SCALE
+    classes = jnp.stack([below.friction, sinkage], axis=-1)
+    classes = jnp.where((edge_distance(terrain, seen) >= 0)[:, None], classes, -1.0)
+    return [
         (under.mean - state.position[2]) / _HEIGHT_SCALE,
-        jnp.where(blocked, _WALL / route.CROWN_SCALE, under.crown),
+        jnp.where(
+            _blocked(terrain, xy, yaw + heading, *size), _WALL / route.CROWN_SCALE, under.crown
+        ),
         under.rise,
         under.bank,
         under.twist,
         jnp.append(cost[0] - distance, cost[1:] - cost[0]) / ROUTE_SCALE,
-    )
+        classes.ravel(),
+    ]
 
-    xy = at(place[CLASS_PLACES])
-    below = query.surface(terrain, xy)
-    sinkage = plate_sinkage(terrain)[below.semantic] / _SINKAGE_SCALE
-    classes = jnp.stack([below.friction, sinkage], axis=-1)
-    classes = jnp.where((edge_distance(terrain, xy) >= 0)[:, None], classes, -1.0)
 
-    parts = [*motion, *ground, classes.ravel()]
-    if embedding is not None:
-        # What a model sees where it has diverged may be anything.
-        parts.append(tiles(jnp.nan_to_num(embedding)).ravel())
-    return jnp.clip(jnp.concatenate(parts), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+def image(terrain: TerrainMap, state: VehicleState, embedding: jax.Array) -> jax.Array:
+    """`IMAGE_SHAPE`, tile by tile, the order in which networks read it, as one vector.
+
+    After the latents `EMBEDDING_SHAPE` comes a channel that is 1 where a cell touches an obstacle
+    or lies off the map, and else 0.
+    """
+    side = patches.CELL_PIXELS * patches.PIXEL_METERS
+    xy = _at(state, jnp.asarray(patches.CELLS_OF_PATCH.T))
+    blocked = _blocked(terrain, xy, state.rpy[2], side, side).reshape(*IMAGE_SHAPE[:2], 1)
+    # What a model sees where it has diverged may be anything.
+    return tiles(jnp.concatenate([jnp.nan_to_num(embedding), blocked], axis=-1)).ravel()
+
+
+def _at(state: VehicleState, points: jax.Array) -> jax.Array:
+    """Points `[..., 2]`, m ahead and to the left of a vehicle, in the world."""
+    # Written out: a matmul may round map coordinates to ten bits on an accelerator.
+    cos, sin = jnp.cos(state.rpy[2]), jnp.sin(state.rpy[2])
+    (x, y), (east, north) = jnp.moveaxis(points, -1, 0), state.position[:2]
+    return jnp.stack([east + (cos * x - sin * y), north + (sin * x + cos * y)], axis=-1)
+
+
+def _blocked(
+    terrain: TerrainMap, xy: jax.Array, yaw: jax.Array, length: Side, width: Side
+) -> jax.Array:
+    """`[...]` bool, whether rectangles touch an obstacle, or their middle is off the map.
+
+    Heights repeat beyond the edge of the map, which would look like the best of roads.
+    """
+    blocked = obstacles.collides(terrain, xy, yaw, length, width)
+    return blocked | (edge_distance(terrain, xy) < 0)

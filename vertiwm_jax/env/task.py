@@ -34,6 +34,8 @@ class NavigationConfig:
     plausible_speed, plausible_height: m/s, and m from the ground, beyond which a model diverged.
     plausible_disagreement: m by which its parts may disagree in a step before it has diverged.
     settle_steps: steps of standing still before a start is handed out.
+    arcs: whether an observation shows the ground along arcs ahead, and what the way to the goal
+        costs from there; if not, that way is a straight line.
     embeddings: whether an observation ends with the ground as a Transformer's encoders see it.
     route: how the way to the goal is found; it is straight where the map is not all known.
     sensing: what sensors see of a map that is unknown at first; by default all of it is known.
@@ -50,6 +52,7 @@ class NavigationConfig:
     plausible_height: float = 4.0
     plausible_disagreement: float = np.inf
     settle_steps: CountOrZero = 15
+    arcs: bool = True
     embeddings: bool = False
     reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
     route: RouteConfig = RouteConfig()
@@ -65,11 +68,16 @@ class NavigationConfig:
     @property
     def observed(self) -> ObservationSpec:
         """What policies see."""
-        return ObservationSpec(image=self.embeddings)
+        return ObservationSpec(self.arcs, self.embeddings)
+
+    @property
+    def straight(self) -> bool:
+        """Whether the way to the goal is a straight line."""
+        return self.sensing.partial or not self.arcs
 
     def route_to(self, terrain: TerrainMap, vehicle: Vehicle, goal: jax.Array) -> Routes:
         """The vehicle's route to the goal `[2]`, m, in the selected world; can be compiled."""
-        if self.sensing.partial:
+        if self.straight:
             return route.straight(self.route, terrain, goal[None])
         return route.plan_one(self.route, terrain, vehicle, goal)
 

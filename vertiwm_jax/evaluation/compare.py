@@ -61,7 +61,8 @@ class CompareConfig:
     seed: CountOrZero = 0
     """Draws the worlds; how policies are trained has seeds of its own."""
     settings: Path | None = None
-    """Folder with `ppo.yaml`, `sac.yaml` and `td3.yaml`; those of the package by default."""
+    """Folder with `ppo.yaml`, `sac.yaml` and `td3.yaml`, or `paper`, the package's own of the
+    paper's trainings; by default those of the package's usual trainings."""
     name: str = "compare"
     """What the name of the run folder begins with; the date follows."""
     runs: Path = Path("runs")
@@ -100,7 +101,10 @@ def compare(config: CompareConfig) -> str:
             (replace(settings[row], ground=ground), _learned(row, settings[row], folder))
             for row, folder in folders.items()
         ]
-        drivers.append((replace(first, ground=ground), first.baselines))
+        # Controllers see the arcs ahead, whatever policies see.
+        seeing = replace(first.navigation, arcs=True, embeddings=False)
+        shown = replace(first, ground=ground, navigation=seeing)
+        drivers.append((shown, shown.baselines))
         key = experiment.TaskConfig(seed=config.seed).key("worlds")
         terrain = suites.suite_worlds(ground, key, first.driven.scale)
         tested = {}
@@ -120,8 +124,11 @@ def compare(config: CompareConfig) -> str:
 
 def training(config: CompareConfig, row: Row) -> TrainConfig:
     """The settings that a policy is trained with."""
-    folder, kind = config.settings, TRAININGS[row.algorithm]
-    file = folder / f"{kind.name}.yaml" if folder else configuration.default_config(kind.name)
+    folder, kind = config.settings or Path(), TRAININGS[row.algorithm]
+    if folder.is_dir() and config.settings:
+        file = folder / f"{kind.name}.yaml"
+    else:
+        file = configuration.default_config(str(folder / kind.name))
     return replace(configuration.load(kind, file), model=row.model, planning=None)
 
 

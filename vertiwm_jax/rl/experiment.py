@@ -3,7 +3,7 @@
 import logging
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal, cast, get_args
 
 import jax
 
@@ -138,6 +138,14 @@ class TrainConfig(TaskConfig):
     """How the policy plans in tests, besides driving as it is; learning does not need it."""
     loop: LoopConfig = LoopConfig()
     """Seeds and checkpoints."""
+
+    def check(self):
+        super().check()
+        if self.base != "none" and self.base not in self.baselines:
+            known = " or ".join(name for name in get_args(Base) if name in self.baselines)
+            raise ValueError(
+                f"base: expected {known} or none, as navigation.arcs is false, found {self.base}"
+            )
 
     @property
     def schedule(self) -> LearningConfig:
