@@ -18,7 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
-from vertiwm_jax import checkpoints, hosts, machine, parallel, xla
+from vertiwm_jax import checkpoints, hosts, kept, machine, parallel, xla
 from vertiwm_jax.config import Count, settings
 from vertiwm_jax.errors import TrainingInterrupted, UserError
 from vertiwm_jax.runs import Progress, Run
@@ -245,17 +245,23 @@ def train(
 @lru_cache(maxsize=1)
 def _compiled(algorithm: Algorithm[Any], mesh: Mesh, kind: Any, shapes: tuple[Any, ...]) -> Any:
     """For data and state of a kind of pytree with leaves of these shapes and types."""
-    _log.info("compiling for %d of %d devices ...", mesh.size, jax.device_count())
-    start, whole = time.perf_counter(), parallel.shardings(mesh)
-    shared = parallel.shardings(mesh, algorithm.specs)
-    kinds = jax.tree.unflatten(kind, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-    places = jax.tree.broadcast((whole, shared), kinds)
-    given = jax.tree.map(lambda x, place: x.update(sharding=place), kinds, places)
-    iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=(shared, whole))
-    with jax.set_mesh(mesh):
-        done = iterate.lower(*given).compile()
+
+    def compiles() -> jax.stages.Compiled:
+        _log.info("compiling for %d of %d devices ...", mesh.size, jax.device_count())
+        start, whole = time.perf_counter(), parallel.shardings(mesh)
+        shared = parallel.shardings(mesh, algorithm.specs)
+        kinds = jax.tree.unflatten(kind, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+        places = jax.tree.broadcast((whole, shared), kinds)
+        given = jax.tree.map(lambda x, place: x.update(sharding=place), kinds, places)
+        iterate = jax.jit(algorithm.iterate, donate_argnums=1, out_shardings=(shared, whole))
+        with jax.set_mesh(mesh):
+            done = iterate.lower(*given).compile()
+        _log.info("compiled in %.0f s", time.perf_counter() - start)
+        return done
+
+    decided_by = algorithm, mesh, str(kind), [(shape, str(dtype)) for shape, dtype in shapes]
+    done = kept.program(decided_by, mesh.devices.flatten().tolist(), compiles)
     machine.release_memory()
-    _log.info("compiled in %.0f s", time.perf_counter() - start)
     return done
 
 

@@ -1,0 +1,142 @@
+"""Compiled programs of earlier processes, found without being traced.
+
+JAX's cache of compiled programs asks for a program that is traced and lowered, to know which one it
+is. Here a program is known by all that decides it, which takes milliseconds.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import importlib.metadata
+import os
+import pickle
+import platform
+import types
+from collections.abc import Callable, Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import serialize_executable
+from jax.sharding import Mesh
+
+from vertiwm_jax import atomic
+
+_PACKAGE = Path(__file__).parent
+_DEPENDENCIES = "chex", "flax", "gymnax", "jax", "jaxlib", "jaxlie", "numpy", "optax"
+_KNOWN = {_PACKAGE.name, "builtins", "functools", *_DEPENDENCIES}
+"""Where all that decides a program may come from: this source, and packages of known versions."""
+_PROGRAMS = 8
+"""How many are kept, 10 MB each; of more, those used longest ago go."""
+
+
+class _CannotTell(Exception):
+    """What decides a program is something that another process could not recognize."""
+
+
+def program(
+    decided_by: Any, devices: Sequence[Any], compiles: Callable[[], jax.stages.Compiled]
+) -> jax.stages.Compiled:
+    """A program as an earlier process has kept it, or else compiled now, and kept.
+
+    Programs lie beside those of JAX's cache, and where that is off nothing is kept. A file that
+    cannot be read, or not be written, only means that the program is compiled.
+
+    Args:
+        decided_by: what decides the program: settings, shapes, functions of this package.
+        devices: of the program.
+        compiles: makes it.
+    """
+    file = _file(decided_by, devices)
+    with contextlib.suppress(Exception):
+        return _load(file, devices)
+    made = compiles()
+    with contextlib.suppress(Exception):
+        _keep(file, made)
+    return made
+
+
+def identity(x: Any) -> Any:
+    """What two things have in common that decide the same programs: strings in tuples.
+
+    Raises `_CannotTell` where that is not known, as of a function that closes over something, or
+    that is of another package.
+    """
+    kind = _name(type(x))
+    if x is None or isinstance(x, bool | int | float | str | bytes | Enum | np.dtype):
+        return kind, repr(x)
+    if isinstance(x, tuple | list):
+        return kind, *map(identity, x)
+    if isinstance(x, dict):
+        return kind, *((identity(key), identity(value)) for key, value in x.items())
+    if isinstance(x, np.ndarray | np.generic | jax.Array):
+        values = np.asarray(x)
+        return kind, str(values.dtype), str(values.shape), values.tobytes().hex()
+    if isinstance(x, Mesh):
+        return kind, repr(x), *(f"{device.id} {device.device_kind}" for device in x.devices.flat)
+    if isinstance(x, functools.partial):
+        return kind, identity(x.func), identity(x.args), identity(x.keywords)
+    if isinstance(x, types.FunctionType) and x.__closure__:
+        raise _CannotTell(x.__qualname__)
+    if isinstance(x, type | types.FunctionType):
+        return kind, _name(x)
+    if dataclasses.is_dataclass(x):
+        fields = ((field.name, getattr(x, field.name)) for field in dataclasses.fields(x))
+        return kind, *((name, identity(value)) for name, value in fields)
+    raise _CannotTell(kind)
+
+
+def _name(x: Any) -> str:
+    """Module and name of a class or function."""
+    name = f"{x.__module__}.{x.__qualname__}"
+    if x.__module__.split(".")[0] not in _KNOWN or "<" in name:
+        raise _CannotTell(name)
+    return name
+
+
+def _file(decided_by: Any, devices: Sequence[Any]) -> Path | None:
+    """Where the program lies if it is kept; None if it is not to be."""
+    config = jax.config.values
+    folder = config["jax_compilation_cache_dir"]
+    if not folder or not config["jax_enable_compilation_cache"] or jax.process_count() > 1:
+        return None
+    # Of JAX all but where and how it keeps things itself.
+    settings = sorted((name, repr(x)) for name, x in config.items() if "cache" not in name)
+    machine = platform.python_version(), os.environ.get("XLA_FLAGS"), devices[0].client.platform
+    try:
+        told = identity(decided_by), settings, _source(), machine, devices[0].device_kind
+    except _CannotTell:
+        return None
+    return Path(folder) / "ready" / hashlib.sha256(repr(told).encode()).hexdigest()
+
+
+@functools.cache
+def _source() -> tuple[str, ...]:
+    """Of this package and what it needs."""
+    versions = (f"{name} {importlib.metadata.version(name)}" for name in _DEPENDENCIES)
+    digest = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest(), *versions
+
+
+def _load(file: Path | None, devices: Sequence[Any]) -> jax.stages.Compiled:
+    assert file is not None
+    parts = pickle.loads(file.read_bytes())
+    found = serialize_executable.deserialize_and_load(
+        *parts, backend=devices[0].client, execution_devices=devices
+    )
+    os.utime(file)
+    return found
+
+
+def _keep(file: Path | None, made: jax.stages.Compiled) -> None:
+    assert file is not None
+    file.parent.mkdir(parents=True, exist_ok=True)
+    atomic.write(file, pickle.dumps(serialize_executable.serialize(made)))
+    newest = sorted(file.parent.iterdir(), key=lambda path: path.stat().st_mtime)
+    for old in newest[:-_PROGRAMS]:
+        old.unlink(missing_ok=True)
