@@ -23,7 +23,7 @@ import numpy as np
 from jax.experimental import serialize_executable
 from jax.sharding import Mesh
 
-from vertiwm_jax import atomic
+from vertiwm_jax import atomic, xla
 
 _PACKAGE = Path(__file__).parent
 _DEPENDENCIES = "chex", "flax", "gymnax", "jax", "jaxlib", "jaxlie", "numpy", "optax"
@@ -73,8 +73,8 @@ def identity(x: Any) -> Any:
     if isinstance(x, dict):
         return kind, *((identity(key), identity(value)) for key, value in x.items())
     if isinstance(x, np.ndarray | np.generic | jax.Array):
-        values = np.asarray(x)
-        return kind, str(values.dtype), str(values.shape), values.tobytes().hex()
+        values = np.ascontiguousarray(x)
+        return kind, str(values.dtype), str(np.shape(x)), hashlib.sha256(values).hexdigest()
     if isinstance(x, Mesh):
         return kind, repr(x), *(f"{device.id} {device.device_kind}" for device in x.devices.flat)
     if isinstance(x, functools.partial):
@@ -105,9 +105,11 @@ def _file(decided_by: Any, devices: Sequence[Any]) -> Path | None:
         return None
     # Of JAX all but where and how it keeps things itself.
     settings = sorted((name, repr(x)) for name, x in config.items() if "cache" not in name)
-    machine = platform.python_version(), os.environ.get("XLA_FLAGS"), devices[0].client.platform
+    first = devices[0]
+    machine = xla.cpu(), first.device_kind, first.client.platform, first.client.platform_version
+    asked = platform.python_version(), os.environ.get("XLA_FLAGS")
     try:
-        told = identity(decided_by), settings, _source(), machine, devices[0].device_kind
+        told = identity(decided_by), settings, _source(), machine, asked
     except _CannotTell:
         return None
     return Path(folder) / "ready" / hashlib.sha256(repr(told).encode()).hexdigest()

@@ -88,8 +88,10 @@ def test_an_obstacle_and_the_edge_of_the_map_stand_in_the_picture(terrain):
     def walls(x, y, yaw):
         env = NavigationEnv(KinematicBicycle(), config)
         pool = task((x, y), (20.0, 20.0), yaw=yaw)
-        seen = env.make_params(BICYCLE, ground, pool, encoders=load_encoders()).start_observation
-        return picture(seen[0, GROUND.start :])[..., -1]
+        params = env.make_params(BICYCLE, ground, pool, encoders=load_encoders())
+        left = params.cost_to_go(env.start(params, 0)[1])  # The way is a straight line.
+        np.testing.assert_allclose(left, np.hypot(x - 20, y - 20), atol=0.2)
+        return picture(params.start_observation[0, GROUND.start :])[..., -1]
 
     # It is 4.1 to 5.9 m ahead and 1 m wide; cells are 0.8 m, from 6.4 m ahead and to the left on.
     ahead = walls(-50.0, 3.0, 0.0)

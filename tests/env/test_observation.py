@@ -7,6 +7,7 @@ from env.worlds import GRASS, SNOW, hills
 from vertiwm_jax.env import observation, route
 from vertiwm_jax.env.route import RouteConfig
 from vertiwm_jax.mechanics.vehicle import load_vehicle
+from vertiwm_jax.networks.policy import ObservationLayout
 from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import obstacles, query
 from vertiwm_jax.terrain.map import TerrainMap
@@ -126,6 +127,17 @@ def test_a_saddle_twists_and_a_hump_crowns():
     corner = (HMMWV.wheelbase**2 + HMMWV.track**2) / 4
     np.testing.assert_allclose(hump[1], corner / 20 / 0.2, atol=0.1)  # bilinear between metres
     np.testing.assert_allclose(hump[2:5], 0, atol=0.05)
+
+
+def test_without_arcs_only_the_vehicle_and_its_goal_are_seen():
+    spec, goal, action = observation.ObservationSpec(arcs=False), jnp.ones(3), jnp.array([0.1, 0.2])
+    here, given = vehicle(2.0, 1.0, 0.4), world()
+    routes = route.straight(ROUTE, given, goal[None, :2])
+    seen = observation.observe(
+        spec, given, HMMWV, here, goal, routes, action, jnp.array([1.5, 0.5])
+    )
+    assert spec.layout == ObservationLayout() and spec.size == len(seen) == 15
+    np.testing.assert_allclose(seen, observe(given, here, goal, action)[:15], atol=1e-6)
 
 
 def test_the_goal_is_in_the_frame_of_the_vehicle():

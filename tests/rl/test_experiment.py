@@ -12,7 +12,7 @@ from vertiwm_jax.env.suites import GroundConfig
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.rl import experiment
-from vertiwm_jax.rl.experiment import TaskConfig
+from vertiwm_jax.rl.experiment import PPOTraining, TaskConfig
 from vertiwm_jax.terrain.classes import STANDARD
 
 GROUND = GroundConfig(suites=("easy",), suite_worlds=1, pairs=2)
@@ -61,3 +61,10 @@ def test_a_skid_steered_vehicle_is_not_told_to_drive_faster_than_it_can_turn():
     with pytest.raises(ValueError, match=r"speed_range: expected at most 1\.33 m/s at full size"):
         TaskConfig(vehicle="husky")
     TaskConfig(vehicle="warthog")  # It is faster than the task asks.
+
+
+def test_a_policy_without_arcs_cannot_correct_a_controller_that_looks_along_them():
+    blind = NavigationConfig(arcs=False, embeddings=True)
+    with pytest.raises(ConfigError, match="base: expected straight to goal or none, as navigation"):
+        PPOTraining(navigation=blind)
+    assert PPOTraining(navigation=blind, base="none").controller is None

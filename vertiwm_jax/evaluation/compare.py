@@ -124,11 +124,11 @@ def compare(config: CompareConfig) -> str:
 
 def training(config: CompareConfig, row: Row) -> TrainConfig:
     """The settings that a policy is trained with."""
-    folder, kind = config.settings or Path(), TRAININGS[row.algorithm]
-    if folder.is_dir() and config.settings:
+    folder, kind = config.settings, TRAININGS[row.algorithm]
+    if folder and folder.is_dir():
         file = folder / f"{kind.name}.yaml"
     else:
-        file = configuration.default_config(str(folder / kind.name))
+        file = configuration.default_config(str((folder or Path()) / kind.name))
     return replace(configuration.load(kind, file), model=row.model, planning=None)
 
 
