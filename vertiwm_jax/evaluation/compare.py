@@ -1,5 +1,6 @@
 """Policies that are trained in several models and tested all alike, in one table."""
 
+import contextlib
 import logging
 import math
 from collections.abc import Mapping
@@ -124,11 +125,11 @@ def compare(config: CompareConfig) -> str:
 
 def training(config: CompareConfig, row: Row) -> TrainConfig:
     """The settings that a policy is trained with."""
-    folder, kind = config.settings, TRAININGS[row.algorithm]
-    if folder and folder.is_dir():
-        file = folder / f"{kind.name}.yaml"
-    else:
-        file = configuration.default_config(str((folder or Path()) / kind.name))
+    folder, kind = config.settings or Path(), TRAININGS[row.algorithm]
+    file = folder / f"{kind.name}.yaml"
+    if config.settings is None or not folder.exists():
+        with contextlib.suppress(ConfigError):
+            file = configuration.default_config(str(folder / kind.name))
     return replace(configuration.load(kind, file), model=row.model, planning=None)
 
 
