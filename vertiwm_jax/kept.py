@@ -13,7 +13,7 @@ import os
 import pickle
 import platform
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ class _CannotTell(Exception):
 
 
 def program(
-    decided_by: Any, devices: Sequence[Any], compiles: Callable[[], jax.stages.Compiled]
+    decided_by: Any, mesh: Mesh, compiles: Callable[[], jax.stages.Compiled]
 ) -> jax.stages.Compiled:
     """A program as an earlier process has kept it, or else compiled now, and kept.
 
@@ -47,12 +47,14 @@ def program(
 
     Args:
         decided_by: what decides the program: settings, shapes, functions of this package.
-        devices: of the program.
+        mesh: of the devices of the program, which decide it, too.
         compiles: makes it.
     """
-    file = _file(decided_by, devices)
+    file = _file(decided_by, mesh)
+    if file is None:
+        return compiles()
     with contextlib.suppress(Exception):
-        return _load(file, devices)
+        return _load(file, mesh)
     made = compiles()
     with contextlib.suppress(Exception):
         _keep(file, made)
@@ -75,8 +77,6 @@ def identity(x: Any) -> Any:
     if isinstance(x, np.ndarray | np.generic | jax.Array):
         values = np.ascontiguousarray(x)
         return kind, str(values.dtype), str(np.shape(x)), hashlib.sha256(values).hexdigest()
-    if isinstance(x, Mesh):
-        return kind, repr(x), *(f"{device.id} {device.device_kind}" for device in x.devices.flat)
     if isinstance(x, functools.partial):
         return kind, identity(x.func), identity(x.args), identity(x.keywords)
     if isinstance(x, types.FunctionType) and x.__closure__:
@@ -97,7 +97,7 @@ def _name(x: Any) -> str:
     return name
 
 
-def _file(decided_by: Any, devices: Sequence[Any]) -> Path | None:
+def _file(decided_by: Any, mesh: Mesh) -> Path | None:
     """Where the program lies if it is kept; None if it is not to be."""
     config = jax.config.values
     folder = config["jax_compilation_cache_dir"]
@@ -105,11 +105,12 @@ def _file(decided_by: Any, devices: Sequence[Any]) -> Path | None:
         return None
     # Of JAX all but where and how it keeps things itself.
     settings = sorted((name, repr(x)) for name, x in config.items() if "cache" not in name)
-    first = devices[0]
+    first = mesh.devices.flat[0]
     machine = xla.cpu(), first.device_kind, first.client.platform, first.client.platform_version
+    devices = repr(mesh), [device.id for device in mesh.devices.flat]
     asked = platform.python_version(), os.environ.get("XLA_FLAGS")
     try:
-        told = identity(decided_by), settings, _source(), machine, asked
+        told = identity(decided_by), devices, settings, _source(), machine, asked
     except _CannotTell:
         return None
     return Path(folder) / "ready" / hashlib.sha256(repr(told).encode()).hexdigest()
@@ -125,8 +126,8 @@ def _source() -> tuple[str, ...]:
     return digest.hexdigest(), *versions
 
 
-def _load(file: Path | None, devices: Sequence[Any]) -> jax.stages.Compiled:
-    assert file is not None
+def _load(file: Path, mesh: Mesh) -> jax.stages.Compiled:
+    devices = mesh.devices.flatten().tolist()
     parts = pickle.loads(file.read_bytes())
     found = serialize_executable.deserialize_and_load(
         *parts, backend=devices[0].client, execution_devices=devices
@@ -135,8 +136,7 @@ def _load(file: Path | None, devices: Sequence[Any]) -> jax.stages.Compiled:
     return found
 
 
-def _keep(file: Path | None, made: jax.stages.Compiled) -> None:
-    assert file is not None
+def _keep(file: Path, made: jax.stages.Compiled) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     atomic.write(file, pickle.dumps(serialize_executable.serialize(made)))
     newest = sorted(file.parent.iterdir(), key=lambda path: path.stat().st_mtime)

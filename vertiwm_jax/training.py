@@ -259,8 +259,8 @@ def _compiled(algorithm: Algorithm[Any], mesh: Mesh, kind: Any, shapes: tuple[An
         _log.info("compiled in %.0f s", time.perf_counter() - start)
         return done
 
-    decided_by = algorithm, mesh, str(kind), [(shape, str(dtype)) for shape, dtype in shapes]
-    done = kept.program(decided_by, mesh.devices.flatten().tolist(), compiles)
+    decided_by = algorithm, str(kind), [(shape, str(dtype)) for shape, dtype in shapes]
+    done = kept.program(decided_by, mesh, compiles)
     machine.release_memory()
     return done
 

@@ -3,7 +3,7 @@
 import logging
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, cast, get_args
+from typing import Any, ClassVar, Literal, cast
 
 import jax
 
@@ -141,10 +141,10 @@ class TrainConfig(TaskConfig):
 
     def check(self):
         super().check()
-        if self.base != "none" and self.base not in self.baselines:
-            known = " or ".join(name for name in get_args(Base) if name in self.baselines)
+        if self.base == "look ahead" and not self.navigation.arcs:
             raise ValueError(
-                f"base: expected {known} or none, as navigation.arcs is false, found {self.base}"
+                "base: expected straight to goal or none, as navigation.arcs is false, found "
+                + self.base
             )
 
     @property
