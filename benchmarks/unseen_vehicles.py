@@ -23,7 +23,7 @@ from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.evaluation import prediction, yardsticks
 from vertiwm_jax.evaluation.prediction import TestWindows
 from vertiwm_jax.learning import schema
-from vertiwm_jax.learning.dataset import load_drives
+from vertiwm_jax.learning.dataset import SplitConfig, load_drives
 from vertiwm_jax.learning.experiment import FitConfig, fit
 from vertiwm_jax.learning.identification import identify
 from vertiwm_jax.learning.pipeline import KINDS
@@ -80,7 +80,8 @@ def models(options: Namespace, vehicle: str) -> Iterator[tuple[str, Dynamics, Pa
     if options.whole:
         names = [f"{vehicle}_{kind}_0.npz" for kind in KINDS]
         world = link(options.data, names, folder / "world")
-        yield "vertiwm, of world 0", *fit(world, config="fit_chrono", **given)
+        # Here, drives of this vehicle are learned from.
+        yield "vertiwm, of world 0", *fit(world, config="fit_chrono", splits=SplitConfig(), **given)
 
 
 def alone() -> dict[str, Any]:

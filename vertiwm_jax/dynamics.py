@@ -77,6 +77,11 @@ def embedding(history: History) -> jax.Array | None:
     return features[0].latents if features else None
 
 
+def rutted(terrain: TerrainMap, history: History) -> TerrainMap:
+    """The map with the ruts that a vehicle has left, if its model remembers them."""
+    return replace(terrain, ruts=getattr(history, "ruts", None))
+
+
 @float32
 def warm_up(
     dynamics: Dynamics,
@@ -93,7 +98,9 @@ def warm_up(
     before, last = (jax.tree.map(itemgetter(i), states) for i in (slice(-1), -1))
     *_, history = along(dynamics, params, terrain, before, commands)
     see = getattr(dynamics, "see", None)
-    return replace(history, features=see(params, terrain, last)) if see else history
+    if see is None:
+        return history
+    return replace(history, features=see(params, rutted(terrain, history), last))
 
 
 @float32
@@ -120,7 +127,7 @@ def along(
 
     def advance(history: History, inputs: tuple[VehicleState, Command]) -> tuple[History, Any]:
         state, command = inputs
-        history = seeing(history, see and see(params, terrain, state))
+        history = seeing(history, see and see(params, rutted(terrain, history), state))
         proposed, history = dynamics.step(params, terrain, history, state, command)
         return seeing(history, None), (proposed, read(history))
 

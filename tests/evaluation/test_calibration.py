@@ -8,8 +8,9 @@ import pytest
 from flax import struct
 
 from vertiwm_jax.evaluation import calibration
-from vertiwm_jax.evaluation.calibration import LEVELS, Calibration
-from vertiwm_jax.evaluation.prediction import TestWindows
+from vertiwm_jax.evaluation.calibration import LEVELS, Calibration, Signs
+from vertiwm_jax.evaluation.prediction import TestWindows, predict
+from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.learning.windows import Windows
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -21,15 +22,17 @@ def errors(seed, count=40_000):
     return (0.02 + 4 * disagreement) * random.exponential(size=count), disagreement
 
 
-def constant(error):
-    """One bound for all disagreements."""
-    return Calibration.measure(error, np.zeros_like(error))
+def signs(seed, count=40_000, unit=0):
+    """`errors` of drives of ten windows each, in one world by one vehicle."""
+    error, disagreement = errors(seed, count)
+    told = {"gates": disagreement, "nothing": np.zeros(count)}
+    number = np.full(count, unit)
+    return Signs(error, told, np.arange(count) // 10, number, number.astype(str))
 
 
-def covered(bounds, error, disagreement, order=None):
+def covered(folds, name="gates"):
     """For each level: it, how often its bound holds, and how often in each part."""
-    given = {"order": disagreement if order is None else order, "it": disagreement}
-    rows = calibration.coverage({"it": bounds}, error, given)
+    rows = [row for row in calibration.coverage(folds) if row["found from"] == name]
     assert [row["bound for"] for row in rows] == ["50%", "80%", "90%", "95%"]
     return [
         (level, share(row["held for"]), [share(part) for part in row["by part"].split(" / ")])
@@ -38,14 +41,13 @@ def covered(bounds, error, disagreement, order=None):
 
 
 def share(text):
-    return float(text.rstrip("%")) / 100
+    return float(text.split("%")[0]) / 100
 
 
 def test_bounds_hold_as_often_as_they_say_at_every_disagreement():
     found = Calibration.measure(*errors(0))
     np.testing.assert_allclose(found.line, [4.0, 0.02], rtol=0.25)
-    error, disagreement = errors(1)
-    for level, held, parts in covered(found, error, disagreement):
+    for level, held, parts in covered([(signs(0), signs(1))]):
         np.testing.assert_allclose(parts, level, atol=0.05)
         assert held == pytest.approx(level, abs=0.02)
 
@@ -58,8 +60,7 @@ def test_the_quantiles_of_exponential_errors():
 
 
 def test_one_bound_for_all_holds_too_often_where_there_is_least_disagreement():
-    found = constant(errors(0)[0])
-    for level, held, parts in covered(found, *errors(1)):
+    for level, held, parts in covered([(signs(0), signs(1))], "nothing"):
         assert held == pytest.approx(level, abs=0.02)
         assert parts[0] > level > parts[-1]
 
@@ -71,9 +72,8 @@ def test_parts_are_fifths_in_the_order_of_disagreement():
 
 
 def test_the_picture_has_every_bound_and_how_often_it_held():
-    (error, disagreement), tested = errors(0), errors(1, count=500)
-    known = Calibration.measure(error, disagreement)
-    left, right = calibration.picture(known, *tested, constant(error)).axes
+    known = Calibration.measure(*errors(0))
+    left, right = calibration.picture(signs(0), signs(1, count=500)).axes
     drawn = {line.get_label(): line.get_xydata() for line in left.lines}
     place, bound = drawn["bound for 90%"].T
     np.testing.assert_allclose(bound, known.bound(place, 0.9))
@@ -84,12 +84,36 @@ def test_the_picture_has_every_bound_and_how_often_it_held():
     assert np.max(level - share) > 0.12
 
 
-def test_parts_can_be_ordered_by_something_else():
-    error, disagreement = errors(0)
-    found = Calibration.measure(error, disagreement)
-    _, held, parts = covered(found, error, disagreement, order=error)[1]
-    assert parts[0] == 1.0 and parts[-1] < 0.5
-    assert held == pytest.approx(0.8, abs=0.01)
+def test_each_world_is_tried_with_bounds_from_the_others():
+    """Where errors of one are three times as large, its bounds hold too seldom."""
+    usual, worse = signs(0, 5_000), signs(1, 5_000, unit=1)
+    worse = replace(worse, error=3 * worse.error, drive=worse.drive + 1_000)
+    told = {name: np.append(x, worse.disagreement[name]) for name, x in usual.disagreement.items()}
+    own = (np.append(getattr(usual, x), getattr(worse, x)) for x in ("drive", "world", "vehicle"))
+    every = Signs(np.append(usual.error, worse.error), told, *own)
+    for apart in ("worlds", "vehicles"):
+        folds = every.each(apart)
+        assert [len(tried.error) for _, tried in folds] == [5_000, 5_000]
+        (_, easy, _), (_, hard, _) = (covered([fold])[2] for fold in folds)
+        assert easy > 0.99 and hard < 0.6
+        _, both, _ = covered(folds)[2]
+        assert both == pytest.approx((easy + hard) / 2, abs=1e-3)
+    with pytest.raises(DataError, match="expected drives of two worlds or more, found of 1"):
+        usual.each("worlds")
+
+
+def test_intervals_of_shares_are_over_drives():
+    """Windows of a drive that err alike count as one."""
+    alike = signs(1, 4_000)
+    first = alike.drive * 10
+    alike = replace(alike, error=alike.error[first], disagreement={
+        name: x[first] for name, x in alike.disagreement.items()
+    })  # fmt: skip
+    wide, narrow = (
+        [float(x.rstrip("%)")) for x in row["held for"].split("(")[1].split("-")]
+        for row in (calibration.coverage([(signs(0), x)])[4] for x in (alike, signs(1, 4_000)))
+    )
+    assert 2 < (wide[1] - wide[0]) / (narrow[1] - narrow[0]) < 5
 
 
 @struct.dataclass
@@ -129,20 +153,25 @@ def standing(windows=3, context=2, horizon=4):
     return TestWindows(Windows(*arrays, context), none, ground)
 
 
+def told(dynamics, apart):
+    test = standing()
+    return Signs.of(predict(dynamics, jnp.float32(apart), test), test)
+
+
 def test_errors_and_disagreement_are_those_of_the_predicted_steps():
     """Two of the context, and four predicted, in the last two of which they disagree."""
-    error, found = calibration.signs(Standing(), jnp.float32(0.25), standing())
-    np.testing.assert_allclose(error, [1, 2, 3], rtol=1e-6)
-    assert list(found) == ["gates", "specialists", "nothing"]
-    np.testing.assert_allclose(found["gates"], 0.25)
-    np.testing.assert_allclose(found["specialists"], 0.5)
+    found = told(Standing(), 0.25)
+    np.testing.assert_allclose(found.error, [1, 2, 3], rtol=1e-6)
+    assert list(found.disagreement) == ["gates", "specialists", "nothing"]
+    np.testing.assert_allclose(found.disagreement["gates"], 0.25)
+    np.testing.assert_allclose(found.disagreement["specialists"], 0.5)
 
 
 def test_a_single_gate_tells_nothing():
-    _, found = calibration.signs(Standing(gates=False), jnp.float32(0.25), standing())
-    assert list(found) == ["specialists", "nothing"]
+    found = told(Standing(gates=False), 0.25)
+    assert list(found.disagreement) == ["specialists", "nothing"]
 
 
 def test_a_prediction_that_is_not_finite_is_an_error():
     with pytest.raises(ValueError, match="found 3 of 3 that are not"):
-        calibration.signs(Standing(), jnp.float32(np.nan), standing())
+        told(Standing(), np.nan)

@@ -127,7 +127,7 @@ def test_an_unwritable_output_is_refused_first(tmp_path, monkeypatch, command):
     for place, name in (
         (report, "drive"),
         (prediction, "predict"),
-        (calibration, "signs"),
+        (calibration, "predict"),
     ):
         monkeypatch.setattr(place, name, begin)
     driven = {"navigation": ["--policy", "straight", "--terrain", maps(tmp_path / "large", 129)]}

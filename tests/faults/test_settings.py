@@ -155,7 +155,7 @@ WORDS = {
     "ppo": ["--seed", "--ppo.num-envs", "--navigation.sensing.range", "--loop.seeds"],
     "fit": ["--seed", "--windows.batch", "--splits.shares", "--loss.velocity"],
     "evaluate prediction": ["--context", "--horizons", "--split", "--splits.shares"],
-    "evaluate calibration": ["--context", "--horizon", "--splits.whole"],
+    "evaluate calibration": ["--context", "--horizons", "--splits.whole"],
     "evaluate navigation": ["--policy", "--seed", "--sensing-range", "--suites", "--pairs"],
     "compare": ["--seed", "--suites", "--simulators", "--jobs"],
     "collect": ["--seed", "--seconds", "--drives", "--kinds", "--simulator"],

@@ -16,6 +16,7 @@ from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import patches, sensing
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.ruts import Ruts
 from vertiwm_jax.terrain.sensing import SensingConfig
 
 CHANNELS = 5
@@ -220,3 +221,24 @@ def test_the_first_layer_of_the_network_alone_learns_and_only_from_latents():
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(by_pose))
     with pytest.raises(TypeError, match=r"encoders.reduce: expected a model that keeps latents"):
         jax.grad(total)(pairs, state, False)
+
+
+def test_ruts_are_seen():
+    """By each vehicle its own, alike by both ways of looking."""
+    terrain, states = world(classes=1), places(3)
+
+    def of_all(looking, deep):
+        def seen(state):
+            about = state.position[:2] + jnp.linspace(-5, 5, 400)[:, None]
+            ruts = Ruts.none(state.position).pressed(about, jnp.full(400, deep))
+            return looking(PAIRS["shared"], replace(terrain, ruts=ruts), state, latents=True)
+
+        return jax.jit(jax.vmap(seen))(states)
+
+    found, expected = of_all(look, 1.0), of_all(_plain, 1.0)
+    untouched = of_all(look, 0.0)
+    as_mapped = jax.jit(jax.vmap(lambda x: look(PAIRS["shared"], terrain, x, latents=True)))
+    for i in range(3):
+        same(one(found, i), one(expected, i), share=0.02)
+        same(one(untouched, i), one(as_mapped(states), i), share=0.02)
+    assert np.abs(found[0].latents - untouched[0].latents).max() > 0.1

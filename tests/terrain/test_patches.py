@@ -9,6 +9,7 @@ from vertiwm_jax.terrain import map as terrain_map
 from vertiwm_jax.terrain import patches
 from vertiwm_jax.terrain.classes import STANDARD
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.ruts import Ruts
 
 CONCRETE, GRASS = STANDARD.names.index("concrete"), STANDARD.names.index("grass")
 
@@ -183,3 +184,17 @@ def test_footprint_must_fit_the_patch():
         patches.footprint_covered(2.4, 45.0)
     with pytest.raises(ValueError, match="patch"):
         patches.footprint_covered(float("nan"), 4.0)
+
+
+def test_ruts_are_as_deep_as_they_were_pressed(terrain):
+    """Pixels lie in the middles of the cells of ruts, of which one in two is pressed."""
+    position = jnp.array([1.3, 2.7, 0.6])
+    offset = 6.35 - 0.1 * jnp.arange(128)
+    x, y = jnp.meshgrid(1.3 + offset, 2.7 + offset, indexing="ij")
+    pressed = jnp.arange(128 * 128).reshape(128, 128) % 2 == 0
+    depth = jnp.where(pressed, 0.2 + 0.1 * jnp.sin(x) * jnp.cos(y), 0.0)
+    xy = jnp.stack([x, y], axis=-1).reshape(-1, 2)
+    ruts = Ruts.none(position).pressed(xy, depth.ravel())
+    whole = patches_of(terrain, 1, position, 0.0).elevation
+    rutted = patches_of(replace(terrain, ruts=ruts), 1, position, 0.0).elevation
+    np.testing.assert_allclose(whole - rutted, depth / 4, atol=2e-6)

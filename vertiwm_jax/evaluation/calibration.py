@@ -10,22 +10,26 @@ from some drives and are tested on others, as in split conformal prediction with
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
+from jax.tree_util import Partial
 
-from vertiwm_jax.config import Count, CountOrZero, settings
+from vertiwm_jax.config import AtLeastOne, Count, CountOrZero, settings
 from vertiwm_jax.dynamics import Dynamics, Params
-from vertiwm_jax.evaluation.prediction import TestWindows, predict
+from vertiwm_jax.evaluation.prediction import Predicted, TestWindows, bootstrap, predict
 from vertiwm_jax.evaluation.tables import Row, markdown, write
 from vertiwm_jax.figures import line, sheet, style
 from vertiwm_jax.learning import dataset
-from vertiwm_jax.learning.dataset import Collection, SplitConfig
+from vertiwm_jax.learning.dataset import Collection, Drives, SplitConfig
 from vertiwm_jax.learning.schema import DataError
-from vertiwm_jax.models.registry import load_model
+from vertiwm_jax.models import files
+from vertiwm_jax.models.registry import load_model, moves_any, moving
+from vertiwm_jax.state import STEP_SECONDS
+from vertiwm_jax.terrain.map import TerrainMap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,42 +46,125 @@ _LEAST = 1e-3  # m, of a scale
 class CalibrationTest:
     """How far off predictions of Verti-WM are, by how much its gates or specialists disagree.
 
-    Bounds on the error are found from the validation drives, and tried on the test drives.
+    Bounds on the error are found from some drives, and tried on others.
     """
 
-    data: Path
-    """Folder of `.npz` files of drives, with the maps they name."""
-    splits: SplitConfig = SplitConfig()
-    """How drives are shared out whose files do not say what they are for."""
+    data: tuple[Path, ...]
+    """Folders of `.npz` files of drives, with the maps they name."""
+    apart: Literal["drives", "worlds", "vehicles"] = "drives"
+    """What bounds have not seen when they are tried. With `drives` they are found from the
+    validation drives, and tried on the test drives. `worlds` and `vehicles` take the drives that
+    are left out of fits: bounds are tried on each world, or vehicle, and found from the others."""
+    splits: SplitConfig = dataset.FITTED
+    """How drives are shared out whose files do not say what they are for, and which worlds are left
+    out of fits."""
     weights: Path | None = None
-    """Folder of a fitted model, instead of the one that comes with the package."""
+    """Folder of a fitted model, or the name of one that comes with the package, `pretrained` or
+    `any_vehicle`. By default the second where files describe their vehicles, and else the first."""
     context: CountOrZero = 16
     """Recorded steps that the model sees first."""
-    horizon: Count = 16
-    """Steps that it predicts."""
+    horizons: Annotated[tuple[Count, ...], AtLeastOne] = (16,)
+    """Steps that it predicts; there are tables for each number of steps, of all windows for which
+    drives are long enough."""
     output: Path | None = None
-    """Folder for tables and a picture."""
+    """Folder for tables and a picture, which is of the most steps."""
 
     def run(self) -> str:
         """Runs the test and writes what `output` asks for; returns the tables as Markdown."""
-        lengths = self.context, self.horizon, self.horizon
-        collection = Collection.of(self.data, self.splits)
-        _log.info("%s", collection)
-        splits: tuple[dataset.Split, ...] = ("validation", "test")
+        collections = [Collection.of(folder, self.splits) for folder in self.data]
+        for collection in collections:
+            _log.info("%s", collection)
+        splits: tuple[dataset.Split, ...] = ("unseen",)
+        if self.apart == "drives":
+            splits = "validation", "test"
         for split in splits:
-            dataset.expect_drives([collection], split, self.context + self.horizon)
-        model = load_model("vertiwm", self.weights)
-        drives = (dataset.load_drives(self.data, split, self.splits) for split in splits)
-        windows = (TestWindows.of(*each, *lengths) for each in drives)
-        (before, known), (error, disagreement) = (signs(*model, each) for each in windows)
-        bounds = {name: Calibration.measure(before, signal) for name, signal in known.items()}
-        best = next(iter(bounds))
-        tables = parts(error, disagreement[best]), coverage(bounds, error, disagreement)
-        text = "\n\n".join(map(markdown, tables))
-        if self.output:
-            figure = picture(bounds[best], error, disagreement[best], bounds["nothing"])
+            dataset.expect_drives(collections, split, self.context + max(self.horizons))
+        given = load_model("vertiwm", self.weights) if self.weights else None
+        loaded = [dataset.load_drives(self.data, split, self.splits) for split in splits]
+        described = any(any(drives.described) for drives, _ in loaded)
+        shipped = files.ANY_VEHICLE if described else files.PRETRAINED
+        model = given or load_model("vertiwm", shipped)
+        found = [self._signs(*model, *each) for each in loaded]
+        tables, figure = [], None
+        for steps in sorted(set(self.horizons)):
+            first, last = found[0][steps], found[-1][steps]
+            folds = [(first, last)] if self.apart == "drives" else first.each(self.apart)
+            made = parts(*_tried(folds)), coverage(folds)
+            title = f"After {steps * STEP_SECONDS:g} s"
+            tables += [title, *map(markdown, made)]
+            figure = picture(*folds[0])
+        text = "\n\n".join(tables)
+        if self.output and figure:
             write(self.output, {"calibration.md": text + "\n", "calibration.png": figure})
         return text
+
+    def _signs(
+        self, dynamics: Dynamics, params: Params, drives: Drives, terrain: TerrainMap
+    ) -> dict[int, Signs]:
+        """By number of steps, of all windows of the drives."""
+        given, own = params, None
+        if moves_any(dynamics):
+            given, own = Partial(moving, params), drives.driven(params.vehicle)
+        most = max(self.horizons)
+        every, tests = TestWindows.nested(
+            drives, terrain, self.context, self.horizons, min(self.horizons)
+        )
+        _log.info("%d steps are predicted in %s windows", most, f"{len(every.drive):,}")
+        predicted = predict(dynamics, given, every, own)
+        return {
+            steps: Signs.of(predicted.cut(rows, steps), test)
+            for steps, (rows, test) in tests.items()
+        }
+
+
+@dataclass(frozen=True)
+class Signs:
+    """Errors of N windows, and what the model said of its certainty.
+
+    error: `[N]` m, of the position after the last step.
+    disagreement: `[N]` m by name, the most telling first: how much the "gates" disagree, if there
+        are several, and the "specialists", summed over the predicted steps; and zeros as "nothing".
+    drive, world: `[N]` of which the windows are; vehicle: `[N]` what drove there is called.
+    """
+
+    error: np.ndarray
+    disagreement: Mapping[str, np.ndarray]
+    drive: np.ndarray
+    world: np.ndarray
+    vehicle: np.ndarray
+
+    @classmethod
+    def of(cls, predicted: Predicted, test: TestWindows) -> Self:
+        """Of predicted windows; raises `DataError` if a prediction is not finite."""
+        (states, read), windows = predicted, test.windows
+        last = np.asarray(windows.state[:, -1, :3])
+        error = np.linalg.norm(states.position[:, -1] - last, axis=-1)
+        if lost := int(np.sum(~np.isfinite(error))):
+            raise DataError(
+                f"expected finite predictions, found {lost} of {len(error)} that are not"
+            )
+        gates = {"gates": read.spread.sum(axis=1)} if np.any(read.spread) else {}
+        told = {**gates, "specialists": read.disagreement.sum(axis=1)}
+        told["nothing"] = np.zeros_like(error)
+        return cls(error, told, test.drive, np.asarray(windows.world), test.vehicle)
+
+    def rows(self, chosen: np.ndarray) -> Signs:
+        """Of some of the windows, `[N]` bool."""
+        told = {name: each[chosen] for name, each in self.disagreement.items()}
+        own = (each[chosen] for each in (self.drive, self.world, self.vehicle))
+        return Signs(self.error[chosen], told, *own)
+
+    def each(self, apart: Literal["worlds", "vehicles"]) -> list[Fold]:
+        """The windows of each world or vehicle to try bounds on, with all others to find them."""
+        units = self.world if apart == "worlds" else self.vehicle
+        names = np.unique(units)
+        if len(names) < 2:
+            raise DataError(f"apart: expected drives of two {apart} or more, found of {len(names)}")
+        return [(self.rows(units != name), self.rows(units == name)) for name in names]
+
+
+Fold = tuple[Signs, Signs]
+"""Windows that bounds are found from, and those that they are tried on."""
 
 
 @dataclass(frozen=True)
@@ -107,34 +194,6 @@ class Calibration:
         return np.quantile(self.scores, level) * self.scale(disagreement)
 
 
-def signs(
-    model: Dynamics, params: Params, test: TestWindows
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Predicts windows, and sums what the model says of its certainty over the predicted steps.
-
-    Args:
-        model, params: the model. Its history has to hold `disagreement` and `spread`, as that of
-            Verti-WM does.
-        test: N windows.
-
-    Returns:
-        `[N]` m, position errors after the last step, and `[N]` m by name, the most telling first:
-        how much the "gates" disagree, if there are several, and the "specialists"; and zeros as
-        "nothing".
-
-    Raises:
-        DataError: a prediction is not finite.
-    """
-    states, read = predict(model, params, test)
-    last = np.asarray(test.windows.state[:, -1, :3])
-    error = np.linalg.norm(states.position[:, -1] - last, axis=-1)
-    if lost := int(np.sum(~np.isfinite(error))):
-        raise DataError(f"expected finite predictions, found {lost} of {len(error)} that are not")
-    gates = {"gates": read.spread.sum(axis=1)} if np.any(read.spread) else {}
-    specialists = read.disagreement.sum(axis=1)
-    return error, {**gates, "specialists": specialists, "nothing": np.zeros_like(error)}
-
-
 def parts(error: np.ndarray, disagreement: np.ndarray) -> list[Row]:
     """A row of errors `[N]`, m, for each equal part of the windows, by disagreement `[N]`, m."""
     return [
@@ -148,38 +207,56 @@ def parts(error: np.ndarray, disagreement: np.ndarray) -> list[Row]:
     ]
 
 
-def coverage(
-    bounds: Mapping[str, Calibration], error: np.ndarray, disagreement: Mapping[str, np.ndarray]
-) -> list[Row]:
-    """A row for each level and calibration: how often its bounds hold for errors `[N]`, m.
+def coverage(folds: Sequence[Fold]) -> list[Row]:
+    """A row for each level and each kind of disagreement: how often bounds from it hold.
 
-    disagreement: `[N]` m, for each calibration. The parts of the windows are by the first of them.
+    The parts of the windows are by the first kind; intervals are over drives.
     """
-    by_part, rows = _parts(next(iter(disagreement.values()))), []
+    error, first = _tried(folds)
+    drive = np.concatenate([tried.drive for _, tried in folds])
+    by_part, rows = _parts(first), []
     for level in LEVELS:
-        for name, calibration in bounds.items():
-            bound = calibration.bound(disagreement[name], level)
+        for name in folds[0][0].disagreement:
+            bound = np.concatenate([_bound(known, tried, name, level) for known, tried in folds])
             held = error <= bound
+            share = bootstrap(held, drive)
             rows.append(
                 {
                     "bound for": f"{level:.0%}",
                     "found from": name,
                     "mean bound, m": f"{bound.mean():.3f}",
-                    "held for": f"{held.mean():.1%}",
+                    "mean errors": f"{bound.mean() / error.mean():.2f}",
+                    "held for": f"{share.mean:.1%} ({share.low:.1%}-{share.high:.1%})",
                     "by part": " / ".join(f"{held[part].mean():.0%}" for part in by_part),
                 }
             )
     return rows
 
 
-def picture(
-    calibration: Calibration, error: np.ndarray, disagreement: np.ndarray, constant: Calibration
-) -> Figure:
+def _bound(known: Signs, tried: Signs, name: str, level: float) -> np.ndarray:
+    found = Calibration.measure(known.error, known.disagreement[name])
+    return found.bound(tried.disagreement[name], level)
+
+
+def _tried(folds: Sequence[Fold]) -> tuple[np.ndarray, np.ndarray]:
+    """Errors and disagreements `[N]`, m, of all windows that bounds are tried on."""
+    best = next(iter(folds[0][0].disagreement))
+    every = [(tried.error, tried.disagreement[best]) for _, tried in folds]
+    error, disagreement = map(np.concatenate, zip(*every, strict=True))
+    return error, disagreement
+
+
+def picture(known: Signs, tried: Signs) -> Figure:
     """Errors over disagreement with their bounds, and how often bounds of any level hold.
 
     The second panel is of the windows with least and with most disagreement, for bounds that know
     the disagreement and for those that do not. On the diagonal, a bound holds as often as it says.
     """
+    error, disagreement = _tried([(known, tried)])
+    best = next(iter(known.disagreement))
+    calibration, constant = (
+        Calibration.measure(known.error, known.disagreement[name]) for name in (best, "nothing")
+    )
     by_part, ordered = _parts(disagreement), np.sort(disagreement)
     levels = np.linspace(0.02, 0.98, 49)
     with style():

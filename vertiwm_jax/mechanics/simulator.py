@@ -29,11 +29,13 @@ from vertiwm_jax.mechanics.newton_euler import (
 )
 from vertiwm_jax.mechanics.scm import ScmParams
 from vertiwm_jax.mechanics.suspension import adhesion_speed, hull_contact, support, suspend
+from vertiwm_jax.mechanics.tracks import Tracks
 from vertiwm_jax.mechanics.vehicle import GRAVITY, Vehicle
 from vertiwm_jax.mechanics.wheel import SoilContact
 from vertiwm_jax.precision import float32
 from vertiwm_jax.state import STEP_SECONDS, Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.ruts import Ruts
 from vertiwm_jax.terrain.soil import Soil
 from vertiwm_jax.vector import Axes, Vector
 
@@ -77,11 +79,12 @@ class SimulatorHistory:
         vehicle are driven to.
     gear: `[]` 1 forward, -1 reverse.
     sinkage: `[4]` m, of the wheels in soil; 0 on rigid ground.
-    rut: `[2]` m, depth of the tracks that the rear wheels find, left and right.
+    rut: `[2]` m, depth of the front wheels' tracks that the rear ones find, left and right.
     wheels: how each wheel met the ground in the last sub-step.
     force: `[4, 3]` N, of the ground on it: along the normal, along the rolling direction and to
         the left.
     speed: `[]` m/s that the sides of a skid-steered vehicle are driven to, None of others.
+    ruts: what the wheels have pressed into the soil, None if the ground forgets it.
     """
 
     wheel_speed: jax.Array
@@ -93,6 +96,7 @@ class SimulatorHistory:
     wheels: GroundContact
     force: jax.Array
     speed: jax.Array | None = None
+    ruts: Ruts | None = None
 
 
 class GroundForces(NamedTuple):
@@ -117,6 +121,9 @@ class Simulator:
 
     substeps: int = 5
     """Steps of the integrator in 0.1 s."""
+    ruts: bool = False
+    """Whether soil remembers how deep wheels have pressed it, so that the next wheel, and the
+    vehicle when it comes back, finds their ruts."""
 
     @float32
     def init(
@@ -142,6 +149,7 @@ class Simulator:
             wheels=contacts(vehicle, terrain, position, axes, travel, none, none)[0],
             force=jnp.zeros((4, 3)).at[:, 0].set(load),
             speed=speed,
+            ruts=Ruts.none(state.position) if self.ruts else None,
         )
 
     @float32
@@ -177,6 +185,8 @@ class Simulator:
             body, history, forces = _substep(params, terrain, *carry, command, seconds)
             return (body, history), forces
 
+        if history.ruts is not None:
+            history = replace(history, ruts=history.ruts.followed(state.position))
         (body, history), forces = jax.lax.scan(substep, (body, history), None, length=self.substeps)
         linear, angular = body.twist
         return (
@@ -218,7 +228,12 @@ def _substep(
 
     sunk = jnp.where(wheels.soft, before, 0.0)
     press = suspend(vehicle, wheels, history.travel, sunk, velocity.dot(n), seconds)
-    soil, rut = stiffened(params, wheels.soil), jnp.concatenate([jnp.zeros(2), history.rut])
+    soil, ruts, tracks = stiffened(params, wheels.soil), history.ruts, None
+    if ruts is None:
+        rut = jnp.concatenate([jnp.zeros(2), history.rut])
+    else:
+        tracks = Tracks.of(vehicle, body.position, axes, wheels, rolling, ahead)
+        rut = tracks.found(ruts, vehicle, before)
     ground, sinkage, load, rate = support(
         vehicle, params.contact, soil, wheels, press, before, (ahead, drift, spin), rut
     )
@@ -282,6 +297,7 @@ def _substep(
         wheels=wheels,
         force=jnp.stack([load, traction, ground.lateral], axis=-1),
         speed=driven.speed,
+        ruts=tracks.left(ruts, sinkage, seconds) if ruts and tracks else None,
     )
     of_wheels, of_hull = (axes.to_world(force).stacked() for force in (of_wheels, of_hull))
     on_ground = GroundForces(of_wheels, of_hull[0])

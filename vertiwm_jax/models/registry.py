@@ -41,6 +41,7 @@ def load_model(
     embeddings: bool = False,
     compute_dtype: ComputeDtype = "float32",
     exact_gradient: bool = False,
+    ruts: bool = False,
 ) -> tuple[Dynamics, Params]:
     """A model and its parameters.
 
@@ -58,20 +59,22 @@ def load_model(
         exact_gradient: whether gradients go through the physics of NeSAM as it is, as planning by
             gradients and adapting soils need it. Fitting needs only how physics answers on the
             whole (`Nesam.gradient`), which is several times cheaper.
+        ruts: whether soil remembers how deep wheels have pressed it; of the simulator, NeSAM and
+            what is fused of it. The others know no wheels.
 
     Raises:
         CheckpointError, ConfigError: as `files.load`, and when the folder holds other parts alone,
             or a model of vehicles that are steered otherwise.
     """
     if name == "builtin":
-        return Simulator(), chrono_like(vehicle or load_vehicle())
+        return Simulator(ruts=ruts), chrono_like(vehicle or load_vehicle())
     if name == "bicycle":
         driven = vehicle or load_vehicle()
         if driven.skid is not None:
             return DifferentialDrive(), differential_of(driven)
         return KinematicBicycle(), bicycle_of(driven)
     folder = files.find(weights) if weights else files.shipped(vehicle)
-    found = load_fitted(folder, soil, embeddings, exact_gradient)
+    found = load_fitted(folder, soil, embeddings, exact_gradient, ruts)
     if name not in found:
         raise CheckpointError(f"{folder}: expected {name}, found {' and '.join(found)} alone")
     dynamics, params = found[name]
@@ -102,12 +105,15 @@ def load_fitted(
     soil: SoilSource | None = None,
     embeddings: bool = False,
     exact_gradient: bool = False,
+    ruts: bool = False,
 ) -> dict[ModelName, tuple[Dynamics, VertiWMParams]]:
     """The models that are fitted in a folder, and their parameters; as `load_model`."""
     config, params = files.load(folder)
     if (soil or config.soil) == "map":
         params = with_soil(params, None)
-    nesam = replace(config.nesam, gradient="exact" if exact_gradient else "mean")
+    gradient: Literal["exact", "mean"] = "exact" if exact_gradient else "mean"
+    simulator = replace(config.nesam.simulator, ruts=ruts)
+    nesam = replace(config.nesam, gradient=gradient, simulator=simulator)
     models: dict[ModelName, tuple[Dynamics, VertiWMParams]] = {}
     if "gate" in config.parts:
         fused = replace(config.verti_wm, nesam=nesam, latents=embeddings)

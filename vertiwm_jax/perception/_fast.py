@@ -25,6 +25,7 @@ from vertiwm_jax.state import VehicleState
 from vertiwm_jax.terrain import _raster, patches
 from vertiwm_jax.terrain.map import ObservedMap, TerrainMap
 from vertiwm_jax.terrain.patches import CELL_PIXELS, RELIEF_METERS
+from vertiwm_jax.terrain.ruts import Ruts
 
 Shared = tuple[tuple[Encoders, ...], TerrainMap]
 """What all vehicles of a batch have in common: weights, and a map without what is not seen."""
@@ -44,17 +45,19 @@ _FOURS = patches.CELLS_OF_PATCH.reshape(2, _SIDE, 2, _SIDE, 2).swapaxes(2, 3).re
 class _Vehicles:
     """What each of V vehicles has of its own; leaves `[V, ...]`.
 
-    world: on which they are; observed: what they know of it, or None; position: m; yaw: rad.
+    world: on which they are; observed: what they know of it, or None; ruts: that they have left
+    there, or None; position: m; yaw: rad.
     """
 
     world: jax.Array
     observed: ObservedMap | None
+    ruts: Ruts | None
     position: jax.Array
     yaw: jax.Array
 
     def on(self, terrain: TerrainMap) -> TerrainMap:
         """The map as one of them, leaves `[...]`, has it."""
-        return replace(terrain, world=self.world, observed=self.observed)
+        return replace(terrain, world=self.world, observed=self.observed, ruts=self.ruts)
 
 
 def look(
@@ -63,7 +66,8 @@ def look(
     """What `perceive` gives for one vehicle, to rounding."""
     hidden = {field.name: None for field in fields(TerrainMap) if field.name not in _SEEN}
     seen = replace(terrain, **hidden)
-    vehicle = _Vehicles(terrain.world, terrain.observed, state.position, state.rpy[2])
+    own = terrain.world, terrain.observed, terrain.ruts
+    vehicle = _Vehicles(*own, state.position, state.rpy[2])
     alone = jax.tree.map(lambda x: x[None], vehicle)
     found = _batched(latents)((encoders, seen), alone)
     return jax.tree.map(lambda x: x[0], found)
@@ -200,11 +204,12 @@ def _projections(
 
 
 def _can_be_coarse(terrain: TerrainMap, vehicles: _Vehicles) -> bool:
-    """Whether there are 3 x 3 vertices and 2 x 2 classes at all, and all of them are known."""
+    """Whether there are 3 x 3 vertices and 2 x 2 classes at all, all known and without ruts."""
     vertices, classes = terrain.elevation.shape[1:], terrain.semantic.shape[1:]
     if not all(isinstance(number, int) for number in vertices + classes):
         return False  # An export takes maps of any size.
-    return vehicles.observed is None and min(vertices) >= 3 and min(classes) >= 2
+    as_mapped = vehicles.observed is None and vehicles.ruts is None
+    return as_mapped and min(vertices) >= 3 and min(classes) >= 2
 
 
 def _is_coarse(terrain: TerrainMap) -> jax.Array:

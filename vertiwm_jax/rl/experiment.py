@@ -270,7 +270,7 @@ def env_of(
     config: TaskConfig, model: ModelName, moves: Dynamics, variation: RandomizationConfig
 ) -> NavigationEnv:
     """The tasks of `environment` without parameters, where the model has been loaded as `moves`."""
-    settling = None if model == "builtin" else config.simulator
+    settling = None if model == "builtin" else replace(config.simulator, ruts=False)
     return NavigationEnv(moves, config.navigation, variation, settling=settling)
 
 
@@ -287,6 +287,7 @@ def dynamics(
         embeddings=config.navigation.embeddings,
         compute_dtype=config.fixed_dtype,
         exact_gradient=exact_gradient,
+        ruts=config.simulator.ruts,
     )
 
 

@@ -17,6 +17,7 @@ from vertiwm_jax.errors import UserError
 from vertiwm_jax.precision import float32
 from vertiwm_jax.terrain import soil
 from vertiwm_jax.terrain.classes import STANDARD, GroundClasses
+from vertiwm_jax.terrain.ruts import Ruts
 from vertiwm_jax.terrain.soil import Soil
 
 if TYPE_CHECKING:
@@ -79,6 +80,7 @@ class TerrainMap:
     grip: `[]` factor on all friction; None for 1.
     observed: what a vehicle knows of the selected world, which queries then answer from; None for
         all.
+    ruts: of one vehicle in the selected world, which patches show; None for untouched ground.
     middles: x, y of the middle of each world in the coordinates of its file, m, static: positions
         are counted from there, see `offset`. Empty where they are as in the file.
     """
@@ -96,6 +98,7 @@ class TerrainMap:
     class_names: tuple[str, ...] = struct.field(pytree_node=False)
     grip: jax.Array | None = None
     observed: ObservedMap | None = None
+    ruts: Ruts | None = None
     middles: tuple[tuple[float, float], ...] = struct.field(pytree_node=False, default=())
 
     def offset(self, world: ArrayLike | None = None) -> np.ndarray:

@@ -86,7 +86,11 @@ def pixels(
 ) -> tuple[jax.Array, jax.Array]:
     """Elevations `[256, 64]` above a height `[]`, m, and colors `[256, 3, 64]`, at `places`."""
     column, row = _raster.on_map(terrain, *(middles[:, :, None] + around[:, None]))
-    elevation = jnp.clip((_raster.bilinear(terrain, row, column) - height) / RELIEF_METERS, -1, 1)
+    ground = _raster.bilinear(terrain, row, column)
+    if terrain.ruts is not None:
+        place = jnp.stack([column, -row], axis=-1)
+        ground -= terrain.ruts.at(terrain.origin + terrain.resolution * place)
+    elevation = jnp.clip((ground - height) / RELIEF_METERS, -1, 1)
     semantic = _raster.classes(terrain, row, column, _raster.cell_index(terrain, row, column))
     palette = terrain.class_rgb / 127.5 - 1
     return elevation, jnp.stack([_raster.gather(c, semantic) for c in palette.T], axis=1)

@@ -5,12 +5,13 @@ from typing import Any
 
 from flax import struct
 
-from vertiwm_jax.dynamics import History
+from vertiwm_jax.dynamics import History, rutted
 from vertiwm_jax.perception.features import Encoders, TerrainFeatures
 from vertiwm_jax.perception.perceive import perceive, reduced
 from vertiwm_jax.precision import float32
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.ruts import Ruts
 from vertiwm_jax.world_model.nesam import Nesam
 from vertiwm_jax.world_model.transformer import Transformer
 from vertiwm_jax.world_model.verti_wm import VertiWMParams
@@ -25,6 +26,11 @@ class AloneHistory:
 
     features: tuple[TerrainFeatures, ...]
     specialist: History
+
+    @property
+    def ruts(self) -> Ruts | None:
+        """What the wheels have pressed into the soil, if NeSAM is asked to remember it."""
+        return getattr(self.specialist, "ruts", None)
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,7 @@ class Alone:
         state, after = self.specialist.propose(
             own, params.vehicle, terrain, seen, history.specialist, state, command
         )
-        return state, AloneHistory(self.see(params, terrain, state), after)
+        return state, AloneHistory(self.see(params, rutted(terrain, after), state), after)
 
     def part_of(self, params: VertiWMParams) -> VertiWMParams:
         """The parameters without what it does not read."""

@@ -16,6 +16,7 @@ from vertiwm_jax.perception.features import TerrainFeatures
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.ruts import Ruts
 from vertiwm_jax.world_model import motion, nesam_inputs
 from vertiwm_jax.world_model.nesam_inputs import MOTION_SIGNS, StepFeatures
 from vertiwm_jax.world_model.normalization import Normalization
@@ -55,6 +56,11 @@ class NesamHistory:
     simulator: SimulatorHistory
     cache: KeyValueCache
     physics: VehicleState
+
+    @property
+    def ruts(self) -> Ruts | None:
+        """What the wheels have pressed into the soil."""
+        return self.simulator.ruts
 
 
 @dataclass(frozen=True)

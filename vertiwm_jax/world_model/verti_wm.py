@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from vertiwm_jax.dynamics import rutted
 from vertiwm_jax.mechanics.vehicle import Vehicle
 from vertiwm_jax.networks.gate import HIDDEN
 from vertiwm_jax.networks.transformer import KeyValueCache
@@ -14,6 +15,7 @@ from vertiwm_jax.perception.perceive import perceive, reduced
 from vertiwm_jax.precision import float32
 from vertiwm_jax.state import Command, VehicleState
 from vertiwm_jax.terrain.map import TerrainMap
+from vertiwm_jax.terrain.ruts import Ruts
 from vertiwm_jax.world_model import fusion, motion
 from vertiwm_jax.world_model.fusion import (
     CONTEXT_SIZE,
@@ -59,6 +61,11 @@ class VertiWMHistory:
     hidden: jax.Array
     context: jax.Array
     alphas: jax.Array
+
+    @property
+    def ruts(self) -> Ruts | None:
+        """What the wheels have pressed into the soil, if NeSAM is asked to remember it."""
+        return self.nesam.ruts
 
     @property
     def coefficients(self) -> jax.Array:
@@ -160,5 +167,5 @@ class VertiWM:
         xi = xi_t + beta * (xi_n - xi_t)
         nu = nu_t + beta * (nu_n - nu_t)
         state = motion.moved(state, xi, nu)
-        seen = self.see(params, terrain, state)
+        seen = self.see(params, rutted(terrain, memory_n), state)
         return state, VertiWMHistory(seen, memory_t, memory_n, hidden, context, alphas)

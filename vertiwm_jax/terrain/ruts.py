@@ -1,0 +1,70 @@
+"""Ruts: the ground remembers how deep wheels have pressed its soil.
+
+A vehicle carries a window of cells that goes with it. What leaves the window is forgotten.
+"""
+
+from dataclasses import replace
+from typing import Self
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+CELL_METERS = 0.1
+"""Side of a cell."""
+CELLS = 320
+"""Cells along each side of the window: 32 m."""
+_ENTERED = 16
+"""Rows and columns that a window moves by at most at once: 1.6 m."""
+
+
+@struct.dataclass
+class Ruts:
+    """What one vehicle has pressed into the soil about it.
+
+    depth: `[320, 320]` m below the undisturbed ground, by x and y; cell (i, j) of the world, which
+        covers x from 0.1 i and y from 0.1 j, is in row i modulo 320 and column j modulo 320.
+    corner: `[2]` int32, the first cell of the window along x and y.
+    """
+
+    depth: jax.Array
+    corner: jax.Array
+
+    @classmethod
+    def none(cls, position: jax.Array) -> Self:
+        """Untouched soil about a vehicle at `[3]` m."""
+        return cls(jnp.zeros((CELLS, CELLS)), _corner(position[:2]))
+
+    def at(self, xy: jax.Array) -> jax.Array:
+        """`[...]` m, how deep the ruts are at points `[..., 2]` m; 0 outside the window."""
+        cell = _cells(xy)
+        inside = jnp.all((cell >= self.corner) & (cell < self.corner + CELLS), axis=-1)
+        row, column = jnp.moveaxis(cell % CELLS, -1, 0)
+        depth = self.depth.at[row, column].get(mode="promise_in_bounds")
+        return jnp.where(inside, depth, 0.0)
+
+    def pressed(self, xy: jax.Array, depth: jax.Array) -> Self:
+        """Soil at points `[N, 2]` m is `[N]` m deep at least."""
+        row, column = (_cells(xy) % CELLS).T
+        return replace(self, depth=self.depth.at[row, column].max(depth))
+
+    def followed(self, position: jax.Array) -> Self:
+        """The window about a vehicle that is now at `[3]` m, within 1.6 m of where it was."""
+        corner = _corner(position[:2])
+        moved = jnp.clip(corner - self.corner, -_ENTERED, _ENTERED)
+        step = jnp.arange(_ENTERED)[:, None]
+        # Those beyond the end that it moves to; the others are named as none at all.
+        first = jnp.where(moved > 0, self.corner + CELLS, self.corner + moved)
+        fresh = jnp.where(step < jnp.abs(moved), (first + step) % CELLS, CELLS)
+        depth = self.depth.at[fresh[:, 0]].set(0.0, mode="drop")
+        depth = depth.at[:, fresh[:, 1]].set(0.0, mode="drop")
+        return replace(self, depth=depth, corner=self.corner + moved)
+
+
+def _cells(xy: jax.Array) -> jax.Array:
+    """`[..., 2]` int32 cells in which points `[..., 2]` m lie."""
+    return jnp.floor(xy / CELL_METERS).astype(jnp.int32)
+
+
+def _corner(xy: jax.Array) -> jax.Array:
+    return _cells(xy) - CELLS // 2
