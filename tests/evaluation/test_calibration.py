@@ -73,7 +73,7 @@ def test_parts_are_fifths_in_the_order_of_disagreement():
 
 def test_the_picture_has_every_bound_and_how_often_it_held():
     known = Calibration.measure(*errors(0))
-    left, right = calibration.picture(signs(0), signs(1, count=500)).axes
+    left, right = calibration.picture([(signs(0), signs(1, count=500))]).axes
     drawn = {line.get_label(): line.get_xydata() for line in left.lines}
     place, bound = drawn["bound for 90%"].T
     np.testing.assert_allclose(bound, known.bound(place, 0.9))
@@ -91,15 +91,15 @@ def test_each_world_is_tried_with_bounds_from_the_others():
     told = {name: np.append(x, worse.disagreement[name]) for name, x in usual.disagreement.items()}
     own = (np.append(getattr(usual, x), getattr(worse, x)) for x in ("drive", "world", "vehicle"))
     every = Signs(np.append(usual.error, worse.error), told, *own)
-    for apart in ("worlds", "vehicles"):
-        folds = every.each(apart)
+    for by in ("worlds", "vehicles"):
+        folds = every.folds(by)
         assert [len(tried.error) for _, tried in folds] == [5_000, 5_000]
         (_, easy, _), (_, hard, _) = (covered([fold])[2] for fold in folds)
         assert easy > 0.99 and hard < 0.6
         _, both, _ = covered(folds)[2]
         assert both == pytest.approx((easy + hard) / 2, abs=1e-3)
     with pytest.raises(DataError, match="expected drives of two worlds or more, found of 1"):
-        usual.each("worlds")
+        usual.folds("worlds")
 
 
 def test_intervals_of_shares_are_over_drives():

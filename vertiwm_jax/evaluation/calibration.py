@@ -4,7 +4,7 @@ Where models that fail for different reasons disagree, at least one of them is w
 (Lakshminarayanan et al., 2017, of ensembles): the two specialists, or several gates. How far off a
 prediction then is has to be measured on recorded drives. The scale and the quantiles of errors come
 from some drives and are tested on others, as in split conformal prediction with normalized scores
-(Lei et al., 2018).
+(Lei et al., 2018), each world or vehicle in turn (Barber et al., 2021, "jackknife+", of folds).
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ _LEAST = 1e-3  # m, of a scale
 class CalibrationTest:
     """How far off predictions of Verti-WM are, by how much its gates or specialists disagree.
 
-    Bounds on the error are found from some drives, and tried on others.
+    Bounds on the error are tried on drives of other worlds, or vehicles, than they are found from.
     """
 
     data: tuple[Path, ...]
     """Folders of `.npz` files of drives, with the maps they name."""
-    apart: Literal["drives", "worlds", "vehicles"] = "drives"
-    """What bounds have not seen when they are tried. With `drives` they are found from the
-    validation drives, and tried on the test drives. `worlds` and `vehicles` take the drives that
-    are left out of fits: bounds are tried on each world, or vehicle, and found from the others."""
+    split: dataset.Split = "test"
+    """Which of the drives; `unseen` are all of the worlds that are left out of fits."""
     splits: SplitConfig = dataset.FITTED
     """How drives are shared out whose files do not say what they are for, and which worlds are left
     out of fits."""
+    by: Literal["worlds", "vehicles"] = "worlds"
+    """Bounds are tried on each world, or vehicle, and found from all others."""
     weights: Path | None = None
     """Folder of a fitted model, or the name of one that comes with the package, `pretrained` or
     `any_vehicle`. By default the second where files describe their vehicles, and else the first."""
@@ -74,25 +74,17 @@ class CalibrationTest:
         collections = [Collection.of(folder, self.splits) for folder in self.data]
         for collection in collections:
             _log.info("%s", collection)
-        splits: tuple[dataset.Split, ...] = ("unseen",)
-        if self.apart == "drives":
-            splits = "validation", "test"
-        for split in splits:
-            dataset.expect_drives(collections, split, self.context + max(self.horizons))
+        dataset.expect_drives(collections, self.split, self.context + max(self.horizons))
         given = load_model("vertiwm", self.weights) if self.weights else None
-        loaded = [dataset.load_drives(self.data, split, self.splits) for split in splits]
-        described = any(any(drives.described) for drives, _ in loaded)
-        shipped = files.ANY_VEHICLE if described else files.PRETRAINED
-        model = given or load_model("vertiwm", shipped)
-        found = [self._signs(*model, *each) for each in loaded]
+        drives, terrain = dataset.load_drives(self.data, self.split, self.splits)
+        shipped = files.ANY_VEHICLE if any(drives.described) else files.PRETRAINED
+        found = self._signs(*(given or load_model("vertiwm", shipped)), drives, terrain)
         tables, figure = [], None
-        for steps in sorted(set(self.horizons)):
-            first, last = found[0][steps], found[-1][steps]
-            folds = [(first, last)] if self.apart == "drives" else first.each(self.apart)
-            made = parts(*_tried(folds)), coverage(folds)
+        for steps, signs in found.items():
+            folds = signs.folds(self.by)
             title = f"After {steps * STEP_SECONDS:g} s"
-            tables += [title, *map(markdown, made)]
-            figure = picture(*folds[0])
+            tables += [title, markdown(parts(*_tried(folds))), markdown(coverage(folds))]
+            figure = picture(folds)
         text = "\n\n".join(tables)
         if self.output and figure:
             write(self.output, {"calibration.md": text + "\n", "calibration.png": figure})
@@ -154,12 +146,15 @@ class Signs:
         own = (each[chosen] for each in (self.drive, self.world, self.vehicle))
         return Signs(self.error[chosen], told, *own)
 
-    def each(self, apart: Literal["worlds", "vehicles"]) -> list[Fold]:
-        """The windows of each world or vehicle to try bounds on, with all others to find them."""
-        units = self.world if apart == "worlds" else self.vehicle
+    def folds(self, by: Literal["worlds", "vehicles"]) -> list[Fold]:
+        """The windows of each world or vehicle to try bounds on, with all others to find them.
+
+        Raises `DataError` where there is one alone.
+        """
+        units = self.world if by == "worlds" else self.vehicle
         names = np.unique(units)
         if len(names) < 2:
-            raise DataError(f"apart: expected drives of two {apart} or more, found of {len(names)}")
+            raise DataError(f"by: expected drives of two {by} or more, found of {len(names)}")
         return [(self.rows(units != name), self.rows(units == name)) for name in names]
 
 
@@ -217,7 +212,7 @@ def coverage(folds: Sequence[Fold]) -> list[Row]:
     by_part, rows = _parts(first), []
     for level in LEVELS:
         for name in folds[0][0].disagreement:
-            bound = np.concatenate([_bound(known, tried, name, level) for known, tried in folds])
+            bound = _bounds(folds, name, level)
             held = error <= bound
             share = bootstrap(held, drive)
             rows.append(
@@ -233,9 +228,13 @@ def coverage(folds: Sequence[Fold]) -> list[Row]:
     return rows
 
 
-def _bound(known: Signs, tried: Signs, name: str, level: float) -> np.ndarray:
-    found = Calibration.measure(known.error, known.disagreement[name])
-    return found.bound(tried.disagreement[name], level)
+def _bounds(folds: Sequence[Fold], name: str, level: float) -> np.ndarray:
+    """`[N]` m, for all windows that bounds are tried on, from one kind of disagreement."""
+    bounds = []
+    for known, tried in folds:
+        found = Calibration.measure(known.error, known.disagreement[name])
+        bounds.append(found.bound(tried.disagreement[name], level))
+    return np.concatenate(bounds)
 
 
 def _tried(folds: Sequence[Fold]) -> tuple[np.ndarray, np.ndarray]:
@@ -246,18 +245,14 @@ def _tried(folds: Sequence[Fold]) -> tuple[np.ndarray, np.ndarray]:
     return error, disagreement
 
 
-def picture(known: Signs, tried: Signs) -> Figure:
+def picture(folds: Sequence[Fold]) -> Figure:
     """Errors over disagreement with their bounds, and how often bounds of any level hold.
 
     The second panel is of the windows with least and with most disagreement, for bounds that know
     the disagreement and for those that do not. On the diagonal, a bound holds as often as it says.
     """
-    error, disagreement = _tried([(known, tried)])
-    best = next(iter(known.disagreement))
-    calibration, constant = (
-        Calibration.measure(known.error, known.disagreement[name]) for name in (best, "nothing")
-    )
-    by_part, ordered = _parts(disagreement), np.sort(disagreement)
+    (error, disagreement), best = _tried(folds), next(iter(folds[0][0].disagreement))
+    by_part, order = _parts(disagreement), np.argsort(disagreement)
     levels = np.linspace(0.02, 0.98, 49)
     with style():
         figure = sheet(7.2, 3.5)
@@ -265,15 +260,16 @@ def picture(known: Signs, tried: Signs) -> Figure:
         left.plot(disagreement, error, ".", color="0.6", markersize=2.5)
         for i, level in enumerate(LEVELS):
             color, dash = line(i)
-            bounds = calibration.bound(ordered, level)
-            left.plot(ordered, bounds, dash, color=color, label=f"bound for {level:.0%}")
+            bounds = _bounds(folds, best, level)[order]
+            label = f"bound for {level:.0%}"
+            left.plot(disagreement[order], bounds, dash, color=color, label=label)
         left.set(xlabel="disagreement [m]", ylabel="position error [m]")
         left.set(xscale="log", yscale="log", ylim=(np.quantile(error, 0.005), None))
-        for i, (name, bounds) in enumerate({"": calibration, "not ": constant}.items()):
+        for i, (name, told) in enumerate({best: "", "nothing": "not "}.items()):
+            held_by = [error <= _bounds(folds, name, level) for level in levels]
             for end, part, dash in (("least", by_part[0], "-"), ("most", by_part[-1], "--")):
-                limits = [bounds.bound(disagreement[part], level) for level in levels]
-                held = [np.mean(error[part] <= limit) for limit in limits]
-                label = f"{name}from disagreement, where it is {end}"
+                held = [np.mean(held[part]) for held in held_by]
+                label = f"{told}from disagreement, where it is {end}"
                 right.plot(levels, held, dash, color=line(i)[0], label=label)
         right.plot([0, 1], [0, 1], color="0.6", linewidth=0.8)
         right.set(xlabel="level of the bound", ylabel="share of errors below it")

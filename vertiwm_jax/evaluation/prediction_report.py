@@ -66,6 +66,8 @@ class PredictionTest:
     describes, or else the HMMWV, and of learned models the one that they were fitted to."""
     soil: SoilSource | None = None
     """Where the models have soils from, if not from where they had them when they were fitted."""
+    ruts: bool = False
+    """Whether soil remembers, from the context on, how deep wheels have pressed it."""
     compare: tuple[Path, ...] = ()
     """Run folders of `fit`, of which each part is a row."""
     split: dataset.Split | None = None
@@ -97,7 +99,7 @@ class PredictionTest:
         given = vehicle.load(self.vehicle or vehicle.HMMWV).vehicle
         learned = self._models(self.weights) if self.weights else {}
         for folder in self.compare:
-            fitted = load_fitted(folder / "model")
+            fitted = load_fitted(folder / "model", ruts=self.ruts)
             learned |= {f"{folder.name}: {part}": model for part, model in fitted.items()}
         drives, terrain = dataset.load_drives(self.data, split, self.splits)
         if self.vehicle:
@@ -115,7 +117,7 @@ class PredictionTest:
                 models[name] = dynamics, Partial(moving, params), own
             else:
                 models[name] = dynamics, params, None
-        models["builtin"] = Simulator(), Partial(chrono_like), driven
+        models["builtin"] = Simulator(ruts=self.ruts), Partial(chrono_like), driven
         if driven.skid is None:
             models["kinematic bicycle"] = KinematicBicycle(), Partial(bicycle_of), driven
         else:
@@ -154,7 +156,7 @@ class PredictionTest:
     def _models(self, weights: Path) -> dict[str, tuple[Dynamics, Params]]:
         """The models that are asked for, but for the simulator, with these weights."""
         return {
-            name: load_model(name, weights, soil=self.soil)
+            name: load_model(name, weights, soil=self.soil, ruts=self.ruts)
             for name in self.models
             if name != "builtin"
         }
