@@ -21,6 +21,7 @@ _APART = {
     "recurrent_baseline",
     "skid_steered",
     "soil_adaptation",
+    "soil_passes",
     "turns",
     "unseen_vehicles",
 }

@@ -71,7 +71,7 @@ def test_the_rut_is_as_wide_as_the_wheels_and_lies_below_them():
     (_, last), (states, _) = there_and_back(Simulator(ruts=True), level("mud"), 0.0)
     x = float(states.position[FORTH, 0])
     across = jnp.arange(-2, 2, 0.05)
-    depth = last.ruts.at(jnp.stack([jnp.full_like(across, x - 2.0), across], axis=-1))
+    depth = last.ruts.at(jnp.full_like(across, x - 2.0), across)
     tracks = np.abs(np.asarray(VEHICLE.wheel_position)[:2, 1])
     width = float(np.max(VEHICLE.wheel_width))
     deep = np.asarray(depth) > 0.02

@@ -52,7 +52,8 @@ class Tracks(NamedTuple):
         speed = jnp.linalg.norm(self.travel, axis=-1, keepdims=True)
         moving = speed > 1e-3
         ahead = jnp.where(moving, self.travel / jnp.where(moving, speed, 1.0), 0.0)
-        return jnp.mean(ruts.at(self.bottom + entry * ahead), axis=0)
+        x, y = jnp.moveaxis(self.bottom + entry * ahead, -1, 0)
+        return jnp.mean(ruts.at(x, y), axis=0)
 
     def left(self, ruts: Ruts, sinkage: jax.Array, seconds: float) -> Ruts:
         """The ruts after the wheels, `[4]` m deep, have rolled for so long."""

@@ -188,9 +188,13 @@ def _projections(
         elevation, rgb = jax.vmap(draw)(vehicles, middles, around)
         return elevation @ of_elevation, jnp.einsum("vncp,cpf->vnf", rgb, of_colors)
 
+    def pressed(own: _Vehicles, middles: jax.Array, around: jax.Array) -> jax.Array | None:
+        return patches.pressed(own.on(terrain), middles, around)
+
     def of_cells(*about: jax.Array) -> tuple[jax.Array, jax.Array]:
         surface, middle, least, most, colors, border = about
-        elevation = jax.vmap(_draw_heights)(surface, middle, least, most, around)
+        ruts = jax.vmap(pressed)(vehicles, middles, around)
+        elevation = jax.vmap(_draw_heights)(surface, middle, least, most, around, ruts)
         return elevation @ of_elevation, _of_colors(colors, border, around, of_colors)
 
     if _can_be_coarse(terrain, vehicles):
@@ -204,12 +208,11 @@ def _projections(
 
 
 def _can_be_coarse(terrain: TerrainMap, vehicles: _Vehicles) -> bool:
-    """Whether there are 3 x 3 vertices and 2 x 2 classes at all, all known and without ruts."""
+    """Whether there are 3 x 3 vertices and 2 x 2 classes at all, and all of them are known."""
     vertices, classes = terrain.elevation.shape[1:], terrain.semantic.shape[1:]
     if not all(isinstance(number, int) for number in vertices + classes):
         return False  # An export takes maps of any size.
-    as_mapped = vehicles.observed is None and vehicles.ruts is None
-    return as_mapped and min(vertices) >= 3 and min(classes) >= 2
+    return vehicles.observed is None and min(vertices) >= 3 and min(classes) >= 2
 
 
 def _is_coarse(terrain: TerrainMap) -> jax.Array:
@@ -244,15 +247,21 @@ def _read_heights(
 
 
 def _draw_heights(
-    surface: jax.Array, place: jax.Array, least: jax.Array, most: jax.Array, around: jax.Array
+    surface: jax.Array,
+    place: jax.Array,
+    least: jax.Array,
+    most: jax.Array,
+    around: jax.Array,
+    ruts: jax.Array | None,
 ) -> jax.Array:
-    """Elevations `[256, 64]` of what `_read_heights` gave."""
+    """Elevations `[256, 64]` of what `_read_heights` gave, without ruts `[256, 64]` m."""
     place = place[..., None] + around[:, None]
     x, y = jnp.clip(place, least[..., None], most[..., None])
     beyond_x, beyond_y = jnp.maximum(x - 1, 0), jnp.maximum(y - 1, 0)
     h = surface[..., None]
     flat, slope, bend = (h[:, i] + x * h[:, i + 1] + beyond_x * h[:, i + 2] for i in (0, 3, 6))
-    return jnp.clip(flat + y * slope + beyond_y * bend, -1, 1)
+    drawn = flat + y * slope + beyond_y * bend
+    return jnp.clip(drawn if ruts is None else drawn - ruts / RELIEF_METERS, -1, 1)
 
 
 def _read_colors(

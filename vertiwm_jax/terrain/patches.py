@@ -87,13 +87,21 @@ def pixels(
     """Elevations `[256, 64]` above a height `[]`, m, and colors `[256, 3, 64]`, at `places`."""
     column, row = _raster.on_map(terrain, *(middles[:, :, None] + around[:, None]))
     ground = _raster.bilinear(terrain, row, column)
-    if terrain.ruts is not None:
-        place = jnp.stack([column, -row], axis=-1)
-        ground -= terrain.ruts.at(terrain.origin + terrain.resolution * place)
+    ruts = pressed(terrain, middles, around)
+    ground = ground if ruts is None else ground - ruts
     elevation = jnp.clip((ground - height) / RELIEF_METERS, -1, 1)
     semantic = _raster.classes(terrain, row, column, _raster.cell_index(terrain, row, column))
     palette = terrain.class_rgb / 127.5 - 1
     return elevation, jnp.stack([_raster.gather(c, semantic) for c in palette.T], axis=1)
+
+
+def pressed(terrain: TerrainMap, middles: jax.Array, around: jax.Array) -> jax.Array | None:
+    """Depth of ruts `[256, 64]`, m, at `places`; None if the map has none."""
+    if terrain.ruts is None:
+        return None
+    column, row = middles[:, :, None] + around[:, None]
+    x = terrain.origin[0] + terrain.resolution * column
+    return terrain.ruts.at(x, terrain.origin[1] - terrain.resolution * row)
 
 
 def footprint_covered(wheel_reach: float, top_speed: float) -> None:

@@ -35,12 +35,17 @@ class Ruts:
         """Untouched soil about a vehicle at `[3]` m."""
         return cls(jnp.zeros((CELLS, CELLS)), _corner(position[:2]))
 
-    def at(self, xy: jax.Array) -> jax.Array:
-        """`[...]` m, how deep the ruts are at points `[..., 2]` m; 0 outside the window."""
-        cell = _cells(xy)
-        inside = jnp.all((cell >= self.corner) & (cell < self.corner + CELLS), axis=-1)
-        row, column = jnp.moveaxis(cell % CELLS, -1, 0)
-        depth = self.depth.at[row, column].get(mode="promise_in_bounds")
+    def at(self, x: jax.Array, y: jax.Array) -> jax.Array:
+        """`[...]` m, how deep the ruts are at points x, y `[...]` m; 0 outside the window."""
+        inside, index = True, 0
+        for meters, first in zip((x, y), self.corner, strict=True):
+            place = _cells(meters) - first
+            inside &= (place >= 0) & (place < CELLS)
+            # Without a division for each point, of which patches have many.
+            stored = place + first % CELLS
+            index = CELLS * index + jnp.where(stored < CELLS, stored, stored - CELLS)
+        flat, index = self.depth.reshape(-1), jnp.where(inside, index, 0)
+        depth = flat.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
         return jnp.where(inside, depth, 0.0)
 
     def pressed(self, xy: jax.Array, depth: jax.Array) -> Self:
