@@ -11,7 +11,16 @@ import numpy as np
 from gymnax.environments import environment, spaces
 
 from vertiwm_jax import machine, parallel, xla
-from vertiwm_jax.dynamics import Dynamics, History, Params, disagreement, embedding, spread, step
+from vertiwm_jax.dynamics import (
+    Dynamics,
+    History,
+    Params,
+    disagreement,
+    embedding,
+    rutted,
+    spread,
+    step,
+)
 from vertiwm_jax.env import observation, route, suites
 from vertiwm_jax.env.agent import Policy, corrected
 from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
@@ -277,7 +286,8 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
                         "embeddings: expected a model that was loaded with them, or encoders to "
                         "see by, found neither; see models.registry.load_encoders"
                     )
-                latents = embed(params.encoders, terrain, state.vehicle)
+                ground = rutted(terrain, state.history)
+                latents = embed(params.encoders, ground, state.vehicle)
         waiting = STEP_SECONDS * jnp.stack([state.stalled, state.backing]).astype(jnp.float32)
         seen = state.vehicle, state.goal, params.routes.select(state.route), state.action, waiting
         spec = self.config.observed
