@@ -230,11 +230,13 @@ def coverage(folds: Sequence[Fold]) -> list[Row]:
 
 def _bounds(folds: Sequence[Fold], name: str, level: float) -> np.ndarray:
     """`[N]` m, for all windows that bounds are tried on, from one kind of disagreement."""
-    bounds = []
-    for known, tried in folds:
-        found = Calibration.measure(known.error, known.disagreement[name])
-        bounds.append(found.bound(tried.disagreement[name], level))
+    every = zip(_measured(folds, name), folds, strict=True)
+    bounds = [found.bound(tried.disagreement[name], level) for found, (_, tried) in every]
     return np.concatenate(bounds)
+
+
+def _measured(folds: Sequence[Fold], name: str) -> list[Calibration]:
+    return [Calibration.measure(known.error, known.disagreement[name]) for known, _ in folds]
 
 
 def _tried(folds: Sequence[Fold]) -> tuple[np.ndarray, np.ndarray]:
@@ -252,7 +254,7 @@ def picture(folds: Sequence[Fold]) -> Figure:
     the disagreement and for those that do not. On the diagonal, a bound holds as often as it says.
     """
     (error, disagreement), best = _tried(folds), next(iter(folds[0][0].disagreement))
-    by_part, order = _parts(disagreement), np.argsort(disagreement)
+    by_part, ordered = _parts(disagreement), np.sort(disagreement)
     levels = np.linspace(0.02, 0.98, 49)
     with style():
         figure = sheet(7.2, 3.5)
@@ -260,9 +262,9 @@ def picture(folds: Sequence[Fold]) -> Figure:
         left.plot(disagreement, error, ".", color="0.6", markersize=2.5)
         for i, level in enumerate(LEVELS):
             color, dash = line(i)
-            bounds = _bounds(folds, best, level)[order]
+            bounds = [found.bound(ordered, level) for found in _measured(folds, best)]
             label = f"bound for {level:.0%}"
-            left.plot(disagreement[order], bounds, dash, color=color, label=label)
+            left.plot(ordered, np.mean(bounds, axis=0), dash, color=color, label=label)
         left.set(xlabel="disagreement [m]", ylabel="position error [m]")
         left.set(xscale="log", yscale="log", ylim=(np.quantile(error, 0.005), None))
         for i, (name, told) in enumerate({best: "", "nothing": "not "}.items()):
