@@ -188,7 +188,7 @@ def test_about_sixteen_vehicles_look_at_a_time(number):
         return vehicles.yaw
 
     yaw = jnp.arange(float(number))
-    vehicles = _fast._Vehicles(jnp.zeros(number, int), None, jnp.zeros((number, 3)), yaw)
+    vehicles = _fast._Vehicles(jnp.zeros(number, int), None, None, jnp.zeros((number, 3)), yaw)
     np.testing.assert_array_equal(_fast._in_turns(look, vehicles), yaw)
     assert len(sizes) == 1 and min(number, 11) <= sizes[0] <= 24
 
