@@ -13,6 +13,7 @@ from vertiwm_jax.env.observation import LAYOUT, arcs_ahead
 from vertiwm_jax.env.suites import circle_tasks
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
+from vertiwm_jax.terrain import query
 from vertiwm_jax.terrain.sensing import SensingConfig
 
 KEY = jax.random.key(0)
@@ -125,6 +126,75 @@ def test_many_are_stepped_in_one_program_and_begin_anew_with_what_they_see_there
 def test_what_does_not_go_together_is_refused():
     with pytest.raises(ValueError, match=r"sensing.range: expected inf with embeddings"):
         NavigationConfig(embeddings=True, sensing=SensingConfig(range=12.0))
+    with pytest.raises(ValueError, match=r"sensing.missing: expected 0 with embeddings"):
+        NavigationConfig(embeddings=True, sensing=SensingConfig(missing=0.1))
     coarse = NavigationConfig(sensing=SensingConfig(range=12.0, cells=8))
     with pytest.raises(ValueError, match=r"sensing.cells: expected at least 23"):
         bicycle_env(ground(hills()), TASK, coarse)
+
+
+SENSING = {
+    "missing": SensingConfig(missing=0.2),
+    "noise": SensingConfig(height_noise=0.03),
+    "displaced": SensingConfig(displaced=0.5),
+}
+
+
+def erroneous(name, tasks=TASK):
+    return bicycle_env(ground(hills()), tasks, NavigationConfig(sensing=SENSING[name]))
+
+
+def test_missing_cells_stay_missing():
+    env, params = erroneous("missing")
+    _, states = drive(env, params)
+    known = np.asarray(states.observed.known)
+    assert (known == known[0]).all()
+    assert known[0].mean() == pytest.approx(0.8, abs=0.02)
+    # Where a cell is missing, the plane through what is seen stands for it.
+    state = jax.tree.map(lambda x: x[40], states)
+    observed = params.observed_map(state)
+    middles = (np.arange(64) + 0.5) * 2.0 - 64.0
+    xy = jnp.asarray(np.stack(np.meshgrid(middles, -middles), axis=-1), jnp.float32)
+    seen, true = (query.height(terrain, xy) for terrain in (observed, params.terrain))
+    plane = observed.observed.plane
+    assumed = plane[0] + xy @ plane[1:]
+    np.testing.assert_allclose(seen[known[0]], true[known[0]], atol=1e-5)
+    assert np.median(np.abs(seen - assumed)[~known[0]]) < 0.05
+
+
+def test_heights_err_by_as_much_as_is_said_and_always_alike():
+    env, params = erroneous("noise", circle_tasks(ground(hills()), radius=50.0))
+    states = [env.start(params, jnp.int32(i))[1] for i in (0, 1)]
+    vertices = jnp.stack(jnp.meshgrid(jnp.arange(-60.0, 61), jnp.arange(-60.0, 61)), axis=-1)
+    true = query.height(params.terrain, vertices)
+    first, again, other = (
+        np.asarray(query.height(params.observed_map(state), vertices) - true)
+        for state in (states[0], states[0], states[1])
+    )
+    np.testing.assert_array_equal(first, again)
+    assert first.std() == pytest.approx(0.03, rel=0.02) and abs(first.mean()) < 1e-3
+    # Neither neighbors nor episodes have anything in common.
+    pairs = (first[1:], first[:-1]), (first[:, 1:], first[:, :-1]), (first, other)
+    assert all(abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.03 for a, b in pairs)
+
+
+def test_a_displaced_map_shows_the_ground_beside():
+    env, params = erroneous("displaced")
+    known, _ = bicycle_env(ground(hills()), TASK)
+    state = env.start(params, jnp.int32(0))[1]
+    aside = np.asarray(state.observed.displaced)
+    assert np.linalg.norm(aside) == pytest.approx(0.5, abs=1e-5)
+    found = env.observe(KEY, state, None, params)
+    position = state.vehicle.position.at[:2].add(aside)
+    there = replace(state, vehicle=replace(state.vehicle, position=position), observed=None)
+    np.testing.assert_allclose(found, known.observe(KEY, there, None, params), atol=1e-5)
+    assert not np.allclose(
+        found, known.observe(KEY, replace(state, observed=None), None, params), atol=1e-3
+    )
+
+
+def test_directions_of_displaced_maps_differ():
+    _, params = erroneous("displaced", circle_tasks(ground(hills()), radius=50.0))
+    aside = np.asarray(params.starts.observed.displaced)
+    turns = np.sort(np.arctan2(aside[:, 1], aside[:, 0]))
+    assert len(turns) == 10 and np.diff(turns).max() < 3 and len(np.unique(turns)) == 10

@@ -289,7 +289,12 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
                 ground = rutted(terrain, state.history)
                 latents = embed(params.encoders, ground, state.vehicle)
         waiting = STEP_SECONDS * jnp.stack([state.stalled, state.backing]).astype(jnp.float32)
-        seen = state.vehicle, state.goal, params.routes.select(state.route), state.action, waiting
+        vehicle = state.vehicle
+        if state.observed is not None:
+            # Where the vehicle is on its map.
+            position = vehicle.position.at[:2].add(state.observed.displaced)
+            vehicle = dataclasses.replace(vehicle, position=position)
+        seen = vehicle, state.goal, params.routes.select(state.route), state.action, waiting
         spec = self.config.observed
         return observation.observe(spec, terrain, params.vehicle, *seen, latents)
 
@@ -348,8 +353,10 @@ def _settle(
             history = model.init(params.dynamics, terrain, vehicle)
         action, zero = params.vehicle.action(standing(), config.speed_range), jnp.int32(0)
         seen = None
-        if config.sensing.partial:
-            seen = sensing.look(config.sensing, terrain, vehicle.position, vehicle.rpy[2])
+        if not config.sensing.exact:
+            pose = vehicle.position, vehicle.rpy[2]
+            seed = jax.lax.bitcast_convert_type(task.start, jnp.uint32).sum()
+            seen = sensing.look(config.sensing, terrain, *pose, seed)
         state = TaskState(
             time=zero,
             vehicle=vehicle,

@@ -38,7 +38,8 @@ class NavigationConfig:
         costs from there; if not, that way is a straight line.
     embeddings: whether an observation ends with the ground as a Transformer's encoders see it.
     route: how the way to the goal is found; it is straight where the map is not all known.
-    sensing: what sensors see of a map that is unknown at first; by default all of it is known.
+    sensing: what sensors see of a map that is unknown at first, and its errors; by default all of
+        it is known as it is.
     """
 
     goal_radius: float = 8.0
@@ -59,11 +60,13 @@ class NavigationConfig:
     sensing: SensingConfig = SensingConfig()
 
     def check(self) -> None:
-        if self.sensing.partial and self.embeddings:
-            raise ValueError(
-                "sensing.range: expected inf with embeddings, which show all of the map, "
-                f"found {self.sensing.range:g}"
-            )
+        for name in ("range", "missing", "height_noise", "displaced") if self.embeddings else ():
+            expected, found = getattr(SensingConfig(), name), getattr(self.sensing, name)
+            if found != expected:
+                raise ValueError(
+                    f"sensing.{name}: expected {expected:g} with embeddings, which show all of the "
+                    f"map as it is, found {found:g}"
+                )
 
     @property
     def observed(self) -> ObservationSpec:

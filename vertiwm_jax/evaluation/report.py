@@ -15,7 +15,7 @@ import numpy as np
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax import figures, machine, runs
-from vertiwm_jax.config import ConfigError, Count, CountOrZero, settings
+from vertiwm_jax.config import ConfigError, Count, CountOrZero, NotNegative, Share, settings
 from vertiwm_jax.env.agent import Agent, Policy
 from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.episodes import NavigationResult, run_episodes
@@ -85,6 +85,12 @@ class NavigationTest:
     """Draws other procedural worlds than those held out."""
     sensing_range: float | None = None
     """Range of sensors, m, inf to know all of the map; by default as in training."""
+    missing: Share | None = None
+    """Share of cells that are missing on the map; by default as in training."""
+    height_noise: NotNegative | None = None
+    """Standard deviation, m, of errors of the map's heights; by default as in training."""
+    displaced: NotNegative | None = None
+    """Distance, m, by which the map lies beside the ground; by default as in training."""
     output: Path | None = None
     """Folder for tables, all episodes and pictures."""
 
@@ -139,8 +145,15 @@ class NavigationTest:
         changes = {name: value for name, value in asked.items() if value is not None}
         if self.suites or self.seed is not None:
             changes["terrain"] = None
-        if self.sensing_range is not None:
-            sensing = replace(config.navigation.sensing, range=self.sensing_range)
+        sensing = config.navigation.sensing
+        asked = {
+            "range": self.sensing_range,
+            "missing": self.missing,
+            "height_noise": self.height_noise,
+            "displaced": self.displaced,
+        }
+        sensing = replace(sensing, **{k: v for k, v in asked.items() if v is not None})
+        if sensing != config.navigation.sensing:
             changes["navigation"] = replace(config.navigation, sensing=sensing)
         if self.planning is not None:
             own = config.planning or ImprovementConfig()

@@ -90,7 +90,22 @@ def _vertices(
         y = terrain.origin[1] - row * terrain.resolution
         return observed.plane[0] + observed.plane[1] * x + observed.plane[2] * y
 
-    return as_observed(terrain, row, column, gather(terrain.elevation, index), assumed)
+    heights, observed = gather(terrain.elevation, index), terrain.observed
+    if observed is not None and observed.noise is not None:
+        error = 2 * uniform(index.astype(jnp.uint32), observed.seed) - 1
+        heights += observed.noise * jnp.sqrt(3.0) * error
+    return as_observed(terrain, row, column, heights, assumed)
+
+
+def uniform(index: jax.Array, seed: jax.Array) -> jax.Array:
+    """Numbers in [0, 1), one for each uint32 index `[...]`: the finalizer of MurmurHash3.
+
+    Where single elements of a large field of random numbers are read, it makes only these.
+    """
+    x = index * jnp.uint32(0x9E3779B9) + seed * jnp.uint32(0x85EBCA6B)
+    x = (x ^ (x >> 16)) * jnp.uint32(0x85EBCA6B)
+    x = (x ^ (x >> 13)) * jnp.uint32(0xC2B2AE35)
+    return ((x ^ (x >> 16)) >> 8).astype(jnp.float32) / 2**24
 
 
 def bilinear(terrain: TerrainMap, row: jax.Array, column: jax.Array) -> jax.Array:

@@ -44,17 +44,23 @@ within it, float32 resolves a tenth of a millimeter."""
 
 @struct.dataclass
 class ObservedMap:
-    """The cells of the selected world that a vehicle knows, and its assumption about the rest.
+    """What a vehicle knows of the selected world, and assumes of the rest; errors of its map.
 
     known: `[n, n]` bool, for cells that tile the map; row 0 is the northernmost.
     plane: `[3]` of unknown ground: its height at x = y = 0, m, and its slopes along x and y.
     semantic: `[]` int32 class id; friction: `[]` friction coefficient, both of unknown ground.
+    displaced: `[2]` m, from where a place is to where the map has it.
+    seed: `[]` uint32, of errors of the map; noise: `[]` m, standard deviation of errors of known
+        heights, None for none.
     """
 
     known: jax.Array
     plane: jax.Array
     semantic: jax.Array
     friction: jax.Array
+    displaced: jax.Array
+    seed: jax.Array
+    noise: jax.Array | None = None
 
 
 @struct.dataclass
