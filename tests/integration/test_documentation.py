@@ -17,6 +17,7 @@ import tyro
 
 from vertiwm_jax import config as configuration
 from vertiwm_jax.cli import COMMANDS, main
+from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.rl.experiment import PPOTraining
 from vertiwm_jax.simulators.collection import CollectConfig
 
@@ -190,6 +191,7 @@ def reading(tmp_path, monkeypatch):
     run.mkdir(parents=True)
     configuration.save(PPOTraining(), run / "config.yaml")
     configuration.save(PPOTraining(), tmp_path / "my.yaml")
+    configuration.save(vehicle.load("rover"), tmp_path / "found.yaml")
     (tmp_path / "configs").symlink_to(ROOT / "configs")
 
 
