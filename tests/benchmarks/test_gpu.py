@@ -26,7 +26,7 @@ def numbers(found):
         yield found
 
 
-@pytest.mark.integration
+@pytest.mark.slow
 def test_small_run_measures_all_parts(tmp_path):
     file = tmp_path / "results" / "gpu.json"
     command = [sys.executable, "-m", "benchmarks.gpu", "--small", "--minutes", "20"]

@@ -233,9 +233,15 @@ def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch
     small = ["--mppi.candidates", "2", "--mppi.decisions", "1", "--mppi.model", "builtin"]
     door("evaluate")([*navigate, "mppi", "--suites", "easy", *small])
     assert "| mppi" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_planning_by_gradients(run, capsys, monkeypatch):
+    find, found = configuration.default_config, {"ppo": run / "config.yaml"}
+    monkeypatch.setattr(configuration, "default_config", lambda name: found.get(name) or find(name))
     small = ["candidates", "2", "improved", "1", "steps", "1", "decisions", "1", "model", "bicycle"]
     options = [f"--shooting.{x}" if i % 2 == 0 else x for i, x in enumerate(small)]
-    door("evaluate")([*navigate, "shooting", "--suites", "easy", *options])
+    door("evaluate")(["navigation", "--policy", "shooting", "--suites", "easy", *options])
     assert "| shooting" in capsys.readouterr().out
 
 
@@ -244,6 +250,8 @@ def test_how_far_sensors_see_can_be_asked_for(tmp_path):
     for asked, found in ((None, np.inf), (5.0, 5.0)):
         changed = NavigationTest("random", sensing_range=asked).changed(config).navigation
         assert changed == NavigationConfig(sensing=SensingConfig(range=found, cells=40))
+    erring = NavigationTest("random", displaced=0.5, missing=0.1).changed(config).navigation
+    assert erring.sensing == SensingConfig(cells=40, displaced=0.5, missing=0.1)
     sighted = replace(config, navigation=NavigationConfig(embeddings=True))
     configuration.save(sighted, tmp_path / "config.yaml")
     navigate = ("navigation", "--policy", tmp_path, "--sensing-range", "5")

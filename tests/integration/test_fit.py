@@ -115,6 +115,7 @@ def test_stages_that_have_ended_are_not_repeated(run, fitted, capsys):
         assert (run / stage / "fitted").stat().st_mtime_ns == times[stage], stage
 
 
+@pytest.mark.slow
 def test_another_gate_for_the_specialists_of_an_earlier_run(run, fitted, capsys):
     capsys.readouterr()
     other = fitted("--model.coefficients", "scalar", "--reuse", str(run))
