@@ -18,7 +18,9 @@ import numpy as np
 from benchmarks._harness import Figures, parser, report
 from vertiwm_jax.mechanics.equilibrium import equilibrium_sinkage
 from vertiwm_jax.mechanics.scm import ScmParams
-from vertiwm_jax.mechanics.wheel import Wheel, WheelForces
+from vertiwm_jax.mechanics.simulator import chrono_like
+from vertiwm_jax.mechanics.vehicle import load_vehicle
+from vertiwm_jax.mechanics.wheel import Float, SoilContact, Wheel, WheelForces
 from vertiwm_jax.simulators.chrono import STEP, modules
 from vertiwm_jax.simulators.chrono_ground import BULLDOZING, CELL, DAMPING, ELASTICITY
 from vertiwm_jax.terrain.soil import PRESETS, stack
@@ -89,7 +91,9 @@ def in_chrono(name: str, slip: float) -> Iterator[Pass]:
 
 
 def modeled(
-    cases: Sequence[tuple[str, float]], contact: ScmParams = STEADY, stiffening: float = STIFFENING
+    cases: Sequence[tuple[str, float]],
+    contact: SoilContact = STEADY,
+    stiffening: Float = STIFFENING,
 ) -> list[Pass]:
     """The passes by the equations of this package: each finds the rut of the ones before."""
     soil = stack([PRESETS[name] for name, _ in cases])
@@ -153,11 +157,18 @@ def main() -> None:
     if chosen.record:
         record()
     cases = list(dict.fromkeys((each.soil, each.slip) for each in recorded()))
-    found = modeled(cases)
+    found, simulator = modeled(cases), chrono_like(load_vehicle())
+    every = {
+        "medians of errors": found,
+        "medians with the simulator's numbers": modeled(
+            cases, simulator.contact, simulator.stiffening
+        ),
+    }
     results: dict[str, Figures] = {}
-    for number in range(1, PASSES + 1):
-        medians = {f"{name}, %": 100 * share for name, share in errors(found, number).items()}
-        results[f"pass {number}: medians of errors"] = medians
+    for title, passes in every.items():
+        for number in range(1, PASSES + 1):
+            medians = {f"{name}, %": 100 * x for name, x in errors(passes, number).items()}
+            results[f"pass {number}: {title}"] = medians
     ours = {each[:3]: each for each in found}
     for each in recorded():
         own = ours[each[:3]]

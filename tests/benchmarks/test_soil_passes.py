@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks import soil_passes
-from vertiwm_jax.mechanics.scm import ScmParams
+from vertiwm_jax.mechanics.simulator import chrono_like
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +47,9 @@ def test_without_memory_the_second_pass_would_be_another(cases):
 
 def test_what_is_fitted_to_drives_that_bounce_is_softer_at_small_slips(cases):
     """So the docs say that a steady wheel pulls less in the simulator than in SCM."""
-    driven = ScmParams(creep_speed=0.4)
-    found = {each[:3]: each for each in soil_passes.modeled(cases, driven, 1.8)}
+    driven = chrono_like(load_vehicle())
+    passes = soil_passes.modeled(cases, driven.contact, driven.stiffening)
+    found = {each[:3]: each for each in passes}
     ratios = [
         found[each[:3]].pull / each.pull
         for each in soil_passes.recorded()

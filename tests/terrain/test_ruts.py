@@ -1,7 +1,5 @@
 """A window of pressed soil that goes with a vehicle."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,6 +48,13 @@ def test_ground_at_the_far_end_is_not_taken_for_what_lies_a_window_away():
     np.testing.assert_allclose(ruts.at(*away.T), [0, 0, 0.1], atol=1e-7)
 
 
+def test_nothing_is_pressed_outside_the_window():
+    """Where it would be taken for ground within."""
+    beyond = jnp.array([[16.05, 0.05], [0.05, -16.05], [40.0, 40.0]])
+    ruts = Ruts.none(at(0, 0)).pressed(beyond, jnp.full(3, 0.1))
+    assert float(jnp.max(ruts.depth)) == 0
+
+
 def test_vehicles_of_a_batch_have_ruts_of_their_own():
     places = jnp.array([[0.0, 0.0, 0.0], [50.0, 20.0, 0.0]])
     ruts = jax.vmap(Ruts.none)(places)
@@ -62,7 +67,7 @@ def test_vehicles_of_a_batch_have_ruts_of_their_own():
 def test_ruts_have_a_gradient_to_their_depth():
     place = jnp.array([[0.05, 0.05]])
 
-    @partial(jax.grad)
+    @jax.grad
     def slope(depth):
         return Ruts.none(at(0, 0)).pressed(place, depth[None]).at(*place.T)[0]
 

@@ -37,21 +37,17 @@ class Ruts:
 
     def at(self, x: jax.Array, y: jax.Array) -> jax.Array:
         """`[...]` m, how deep the ruts are at points x, y `[...]` m; 0 outside the window."""
-        inside, index = True, 0
-        for meters, first in zip((x, y), self.corner, strict=True):
-            place = _cells(meters) - first
-            inside &= (place >= 0) & (place < CELLS)
-            # Without a division for each point, of which patches have many.
-            stored = place + first % CELLS
-            index = CELLS * index + jnp.where(stored < CELLS, stored, stored - CELLS)
+        inside, index = self._stored(x, y)
         flat, index = self.depth.reshape(-1), jnp.where(inside, index, 0)
         depth = flat.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
         return jnp.where(inside, depth, 0.0)
 
     def pressed(self, xy: jax.Array, depth: jax.Array) -> Self:
-        """Soil at points `[N, 2]` m is `[N]` m deep at least."""
-        row, column = (_cells(xy) % CELLS).T
-        return replace(self, depth=self.depth.at[row, column].max(depth))
+        """Soil at points `[N, 2]` m is `[N]` m deep at least; none outside the window changes."""
+        inside, index = self._stored(*xy.T)
+        index = jnp.where(inside, index, CELLS**2)
+        flat = self.depth.reshape(-1).at[index].max(depth, mode="drop")
+        return replace(self, depth=flat.reshape(CELLS, CELLS))
 
     def followed(self, position: jax.Array) -> Self:
         """The window about a vehicle that is now at `[3]` m, within 1.6 m of where it was."""
@@ -64,6 +60,17 @@ class Ruts:
         depth = self.depth.at[fresh[:, 0]].set(0.0, mode="drop")
         depth = depth.at[:, fresh[:, 1]].set(0.0, mode="drop")
         return replace(self, depth=depth, corner=self.corner + moved)
+
+    def _stored(self, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Whether points lie in the window, and where their cells lie in `depth`, flat."""
+        inside, index = jnp.bool(True), jnp.int32(0)
+        for meters, first in zip((x, y), self.corner, strict=True):
+            place = _cells(meters) - first
+            inside &= (place >= 0) & (place < CELLS)
+            # Without a division for each point, of which patches have many.
+            stored = place + first % CELLS
+            index = CELLS * index + jnp.where(stored < CELLS, stored, stored - CELLS)
+        return inside, index
 
 
 def _cells(xy: jax.Array) -> jax.Array:
