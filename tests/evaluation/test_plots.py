@@ -53,6 +53,17 @@ def test_trajectories_show_every_drive():
     assert overhead.get_title() == "world 0"
 
 
+def test_risks_are_drawn_of_those_that_foretell_them():
+    drives = {name: (np.zeros((9, 3)), np.zeros((9, 3))) for name in ("learned", "straight")}
+    goal, risks = np.array([60.0, 0.0]), {"learned": np.linspace(0, 1, 9)}
+    figure = plots.trajectories(ground(), 0, drives, goal, 8.0, risks)
+    *_, roll, pitch, below = figure.axes
+    (drawn,) = below.lines
+    np.testing.assert_array_equal(drawn.get_ydata(), risks["learned"])
+    assert drawn.get_color() == roll.lines[0].get_color()
+    assert below.get_xlabel() and not pitch.get_xlabel()
+
+
 def test_maps_are_shown_with_a_legend_of_their_ground():
     semantic = np.full((16, 16), GRASS)
     semantic[0, 0] = SNOW

@@ -17,16 +17,19 @@ from doors import door, opened, refusal
 from vertiwm_jax import checkpoints, machine, runs
 from vertiwm_jax import config as configuration
 from vertiwm_jax.deploy import run_policy
+from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.observation import IMAGE_SHAPE, OBSERVATION_SIZE
 from vertiwm_jax.env.task import NavigationConfig
+from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation import report
 from vertiwm_jax.evaluation.report import NavigationTest
 from vertiwm_jax.models import files as model_files
 from vertiwm_jax.models.config import ModelConfig
 from vertiwm_jax.models.registry import load_model
 from vertiwm_jax.planning.improvement import ImprovementConfig
-from vertiwm_jax.rl import experiment
+from vertiwm_jax.rl import experiment, risk
 from vertiwm_jax.rl.experiment import PPOTraining
+from vertiwm_jax.rl.policy import load_policy
 from vertiwm_jax.runs import Run
 from vertiwm_jax.terrain import files
 from vertiwm_jax.terrain.map import TerrainMap
@@ -233,6 +236,39 @@ def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch
     small = ["--mppi.candidates", "2", "--mppi.decisions", "1", "--mppi.model", "builtin"]
     door("evaluate")([*navigate, "mppi", "--suites", "easy", *small])
     assert "| mppi" in capsys.readouterr().out
+
+
+def test_risk_is_learned_kept_and_told(run, tmp_path, capsys, monkeypatch):
+    own = shutil.copytree(run, tmp_path / "run")
+    given = ["--policy", str(own), "--output", str(tmp_path / "told")]
+    # What all of these episodes end with, after three seconds.
+    monkeypatch.setattr(risk, "FAILURES", (TerminationReason.TIMED_OUT,))
+    monkeypatch.setattr(risk, "_AHEAD", 15)
+    monkeypatch.setattr(risk, "_UPDATES", 100)
+    monkeypatch.setattr(risk.machine, "together", lambda cpu, accelerator: 16)
+    door("evaluate")(["risk", *given, "--starts", "8", "--suite-worlds", "1"])
+    table = capsys.readouterr().out
+    assert "windows of 3 s" in table and "failed / foretold" in table
+    assert (tmp_path / "told" / "risk.md").read_text().strip() in table
+    assert (tmp_path / "told" / "risk.png").read_bytes()[:4] == b"\x89PNG"
+
+    assert load_policy(run).risk is None
+    config = experiment.load(own / "config.yaml")
+    policies = {"ppo": load_policy(own).acting, REFERENCE: config.baselines[REFERENCE]}
+    foretold = policies["ppo"].risk(np.zeros((3, OBSERVATION_SIZE)))
+    assert foretold.shape == (3,) and np.all((foretold > 0) & (foretold < 1))
+    worlds = experiment.held_out(config)
+    groups = report.drive(config, worlds, policies, config.world_suites)
+    report.write(tmp_path / "told", groups, worlds, 8.0)
+    rows = list(csv.DictReader((tmp_path / "told" / "episodes.csv").open()))
+    for row in rows:
+        highest = row["highest_risk"]
+        assert highest == "" if row["policy"] == REFERENCE else 0 < float(highest) < 1
+
+    file = own / "policy" / "risk.npz"
+    file.write_bytes(file.read_bytes()[:-100])
+    message = refusal(door("evaluate"), "navigation", "--policy", own)
+    assert f"{file}: cannot read weights" in message
 
 
 @pytest.mark.slow

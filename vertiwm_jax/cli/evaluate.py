@@ -10,12 +10,14 @@ from vertiwm_jax.evaluation.calibration import CalibrationTest
 from vertiwm_jax.evaluation.floor import FloorTest
 from vertiwm_jax.evaluation.prediction_report import PredictionTest
 from vertiwm_jax.evaluation.report import NavigationTest
+from vertiwm_jax.evaluation.risk import RiskTest
 
 Test = (
     Annotated[PredictionTest, tyro.conf.subcommand("prediction")]
     | Annotated[FloorTest, tyro.conf.subcommand("floor")]
     | Annotated[CalibrationTest, tyro.conf.subcommand("calibration")]
     | Annotated[NavigationTest, tyro.conf.subcommand("navigation")]
+    | Annotated[RiskTest, tyro.conf.subcommand("risk")]
 )
 
 

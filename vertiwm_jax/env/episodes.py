@@ -16,8 +16,8 @@ from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.state import STEP_SECONDS
 
-Keep = Callable[[TaskParams, TaskState], Any]
-"""What is kept of the parameters of a task and of each state of an episode."""
+Keep = Callable[[Agent, Now], Any]
+"""What is kept of an agent and each moment of its episode."""
 Episode = tuple[Memory, jax.Array, TaskState]
 """An agent's memory, the observation, and where the episode stands; or leaves `[P, ...]` of P."""
 
@@ -80,7 +80,7 @@ def run_episodes(
         task: what it is run with.
         agent: what drives.
         key: of all that is random.
-        keep: gives what is kept of each state besides its pose.
+        keep: gives what is kept of each moment besides the pose.
 
     Returns:
         P episodes.
@@ -132,9 +132,10 @@ def _run(
         observation, state = env.start(task, number)
         return agent.init(Now(task, state, observation)), observation, state
 
-    @partial(parallel.vmap, in_axes=(None, 0))
-    def kept(task: TaskParams, state: TaskState) -> tuple[jax.Array, jax.Array, Any]:
-        more = keep(task, state) if keep else None
+    @partial(parallel.vmap, in_axes=(None, None, 0))
+    def kept(agent: Agent, task: TaskParams, episode: Episode) -> tuple[jax.Array, jax.Array, Any]:
+        _, observation, state = episode
+        more = keep(agent, Now(task, state, observation)) if keep else None
         return state.vehicle.position, state.vehicle.rpy, more
 
     @partial(parallel.vmap, in_axes=(None, None, 0, 0))
@@ -148,7 +149,7 @@ def _run(
     def advance(episodes: Episode, step: jax.Array) -> tuple[Episode, tuple]:
         keys = jax.random.split(jax.random.fold_in(key, step), count)
         episodes = drive(agent, task, episodes, keys)
-        return episodes, kept(task, episodes[2])
+        return episodes, kept(agent, task, episodes)
 
     def drive_on(episodes: Episode, step: jax.Array) -> tuple[Episode, tuple]:
         keys = jax.random.split(jax.random.fold_in(planning, step), count)
@@ -156,7 +157,7 @@ def _run(
         return jax.lax.scan(advance, episodes, step + jnp.arange(interval))
 
     def stay(episodes: Episode, step: jax.Array) -> tuple[Episode, tuple]:
-        last = kept(task, episodes[2])
+        last = kept(agent, task, episodes)
         return episodes, jax.tree.map(lambda x: jnp.broadcast_to(x, (interval, *x.shape)), last)
 
     def decide(episodes: Episode, step: jax.Array) -> tuple[Episode, tuple]:
@@ -172,7 +173,7 @@ def _run(
         path = path.reshape(-1, *path.shape[2:])
         return jnp.concatenate([start[None], path[:length]])
 
-    return result(end, *jax.tree.map(joined, kept(task, first[2]), paths))
+    return result(end, *jax.tree.map(joined, kept(agent, task, first), paths))
 
 
 def _plan(agent: Agent, task: TaskParams, episodes: Episode, keys: jax.Array) -> Episode:

@@ -98,18 +98,21 @@ def trajectories(
     drives: Mapping[str, tuple[np.ndarray, np.ndarray]],
     goal: np.ndarray,
     goal_radius: float,
+    risks: Mapping[str, np.ndarray] | None = None,
 ) -> Figure:
     """Draws drives over the shaded map of one world, with roll and pitch over time beside it.
 
     drives: by name, positions `[T, 3]` m and roll, pitch, yaw `[T, 3]` rad, all to the one goal
-        `[2 or 3]`, m.
+        `[2 or 3]`, m; risks: of some of them, `[T]` probabilities, drawn below if there are any.
     """
+    risks = risks or {}
     with figures.style():
         figure = figures.sheet(9.0, 4.6)
-        grid = figure.add_gridspec(2, 2, width_ratios=(1.1, 1))
+        grid = figure.add_gridspec(3 if risks else 2, 2, width_ratios=(1.1, 1))
         overhead = figure.add_subplot(grid[:, 0])
         roll = figure.add_subplot(grid[0, 1])
         pitch = figure.add_subplot(grid[1, 1], sharex=roll)
+        lowest = figure.add_subplot(grid[2, 1], sharex=roll) if risks else pitch
         picture.draw_map(overhead, terrain, world, f"world {world}")
         for i, (name, (position, rpy)) in enumerate(drives.items()):
             color, dash = figures.line(i)
@@ -121,10 +124,16 @@ def trajectories(
             overhead.plot(x[0], y[0], "o", **_MARK, markersize=5, label=start)
             for axes, angle in ((roll, rpy[:, 0]), (pitch, rpy[:, 1])):
                 axes.plot(*timed(np.degrees(angle)), dash, color=color)
+            if name in risks:
+                lowest.plot(*timed(risks[name]), dash, color=color)
         draw_goal(overhead, goal, goal_radius)
         roll.set(ylabel="roll [deg], left side up")
-        pitch.set(ylabel="pitch [deg], nose down", xlabel="time [s]")
-        roll.tick_params(labelbottom=False)
+        pitch.set(ylabel="pitch [deg], nose down")
+        if risks:
+            lowest.set(ylabel="risk within 3 s", ylim=(0, 1))
+        lowest.set(xlabel="time [s]")
+        for axes in {roll, pitch} - {lowest}:
+            axes.tick_params(labelbottom=False)
         handles, _ = overhead.get_legend_handles_labels()
         handles.sort(key=lambda line: line.get_label() not in drives)
         legend = [*handles, *picture.ground_legend(terrain, [world])]

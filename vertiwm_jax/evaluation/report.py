@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from vertiwm_jax import config as configuration
 from vertiwm_jax import figures, machine, runs
 from vertiwm_jax.config import ConfigError, Count, CountOrZero, NotNegative, Share, settings
-from vertiwm_jax.env.agent import Agent, Policy
+from vertiwm_jax.env.agent import Agent, Now, Policy
 from vertiwm_jax.env.controllers import REFERENCE
 from vertiwm_jax.env.episodes import NavigationResult, run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
@@ -28,6 +28,7 @@ from vertiwm_jax.planning.mppi import MPPI, MPPIConfig
 from vertiwm_jax.planning.shooting import Shooting, ShootingConfig
 from vertiwm_jax.rl import experiment
 from vertiwm_jax.rl.experiment import TaskConfig, TrainConfig
+from vertiwm_jax.rl.policy import DeterministicPolicy
 from vertiwm_jax.simulators import processes
 from vertiwm_jax.simulators.chrono import Chrono
 from vertiwm_jax.terrain import files
@@ -218,10 +219,16 @@ def drive(
             if simulator == "chrono":
                 results[name] = external.evaluate(chrono, mapped, tasks, *inputs)
             else:
-                results[name] = run_episodes(*inputs)
+                foretells = isinstance(policy, DeterministicPolicy) and policy.risk is not None
+                results[name] = run_episodes(*inputs, _risk if foretells else None)
             solved, seconds = int(np.sum(results[name].success)), time.perf_counter() - start
             _log.info("  %s: %d solved, compiled and driven in %.0f s", name, solved, seconds)
     return by_suite(results, suites or [GIVEN_MAPS] * terrain.worlds)
+
+
+def _risk(agent: Agent, now: Now) -> jax.Array:
+    """`[]` of a policy that foretells it."""
+    return cast(Any, agent).policy.risk(now.observation)
 
 
 def by_suite(results: Results, suites: Sequence[str]) -> dict[str, Results]:
@@ -250,8 +257,13 @@ def write(
         first = next(iter(results.values()))
         hard = int(np.argmax(2 * ~results[REFERENCE].success + first.success))
         paths = {policy: result.path(hard) for policy, result in results.items()}
+        risks = {
+            policy: result.kept[hard, : len(paths[policy][0])]
+            for policy, result in results.items()
+            if result.kept is not None
+        }
         goal = np.asarray(first.goal[hard]), goal_radius
-        figure = plots.trajectories(terrain, int(first.world[hard]), paths, *goal)
+        figure = plots.trajectories(terrain, int(first.world[hard]), paths, *goal, risks)
         drawn[f"trajectories_{name}.png"] = figure
     texts = {
         "summary.md": markdown(groups) + "\n",
@@ -305,6 +317,7 @@ def _episodes(groups: Mapping[str, Results], terrain: TerrainMap) -> list[tables
             "abs_pitch_deg": math.degrees(float(result.abs_pitch[i])),
             "driven_m": float(result.driven[i]),
             "final_distance_m": float(result.final_distance[i]),
+            "highest_risk": "" if result.kept is None else float(result.kept[i].max()),
         }
         for suite, results in groups.items()
         for policy, result in results.items()

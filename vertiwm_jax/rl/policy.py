@@ -1,10 +1,11 @@
 """A trained policy in a folder of its own, apart from the training that made it."""
 
 import io
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal, Self, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -30,10 +31,14 @@ from vertiwm_jax.networks.policy import (
     twin_values,
 )
 from vertiwm_jax.precision import float32
+from vertiwm_jax.rl.risk import Risk
 from vertiwm_jax.rl.running_statistics import RunningStatistics
+
+T = TypeVar("T")
 
 FOLDER = "policy"
 """Name of the folder in that of a run."""
+_RISK = "risk.npz"
 _ACTIONS = 2
 _STATISTICS = "mean", "variance", "count"
 Base = Literal["look ahead", "straight to goal", "none"]
@@ -46,12 +51,14 @@ class DeterministicPolicy:
     actor: the network, static; params: its weights.
     observations: statistics that its observations are normalized by.
     base: a controller, static, whose actions it corrects; None if it acts by itself.
+    risk: how likely it is to fail, where that was learned.
     """
 
     actor: Actor | TanhNormalActor = struct.field(pytree_node=False)
     params: Any
     observations: RunningStatistics
     base: agent.Policy | None = struct.field(pytree_node=False, default=None)
+    risk: Risk | None = None
 
     def __call__(self, observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         """`[..., O]` observations to `[..., A]` actions in [-1, 1]; the key is of the base."""
@@ -126,6 +133,11 @@ class PolicyConfig:
         actor = kind(_ACTIONS, self.hidden, cast(Any, self.initial_log_std), layout)
         return actor, Critic(self.hidden, layout)
 
+    @property
+    def risk_network(self) -> Critic:
+        """What learns how likely it fails."""
+        return Critic(self.hidden, self.navigation.observed.layout)
+
 
 @struct.dataclass
 class Policy:
@@ -165,6 +177,12 @@ class Policy:
         """`[..., O]` observations to `[...]` returns that it expects, in units of reward."""
         return self.worth(observation)
 
+    @property
+    def risk(self) -> Risk | None:
+        """`[..., O]` observations to `[...]` probabilities that it rolls over, collides or stands
+        still within 3 s; None before `vertiwm evaluate risk` has learned them."""
+        return self.learned.risk
+
 
 def save(folder: Path, config: PolicyConfig, value: Value) -> None:
     """Writes the folder of a policy, the one that `value` is of; leaves have an axis of seeds.
@@ -175,10 +193,18 @@ def save(folder: Path, config: PolicyConfig, value: Value) -> None:
     observations = value.policy.observations
     arrays = {"actor": value.policy.params, "critic": value.params, "return_scale": value.scale}
     arrays |= {f"observation_{name}": getattr(observations, name) for name in _STATISTICS}
-    stream = io.BytesIO()
-    np.savez(stream, **named_leaves(jax.device_get(arrays)))
+    # A risk would be that of other weights.
+    (folder / _RISK).unlink(missing_ok=True)
     atomic.write(folder / "policy.yaml", configuration.dump(config))
-    atomic.write(folder / "weights.npz", stream.getvalue())
+    _write(folder / "weights.npz", arrays)
+
+
+def save_risks(folder: Path, risks: Sequence[Risk]) -> None:
+    """Writes how likely the policies of a run, or of its folder `policy`, fail: one of each seed.
+
+    `WriteError` where that is not possible.
+    """
+    _write(_place(folder) / _RISK, jax.tree.map(lambda *x: np.stack(x), *risks))
 
 
 @float32
@@ -197,21 +223,44 @@ def load_policy(folder: str | Path, seed: int = 0) -> Policy:
         ConfigError: there is no such seed, or `policy.yaml` is malformed.
     """
     folder = Path(folder)
-    inside = folder / FOLDER
-    place = inside if inside.is_dir() else folder
+    place = _place(folder)
     file = place / "weights.npz"
     if not file.is_file():
         raise CheckpointError(f"{folder}: expected the folder of a trained policy, found none")
     config = configuration.load(PolicyConfig, place / "policy.yaml")
     if not 0 <= seed < config.seeds:
         raise ConfigError(f"{folder}: seed: expected 0 to {config.seeds - 1}, found {seed}")
-    refused = refusing(lambda found: CheckpointError(f"{file}: cannot read weights: {found}"))
-    with refused, np.load(file, allow_pickle=False) as stored:
-        arrays = {name: jnp.asarray(stored[name][seed]) for name in stored.files}
     actor, critic = config.networks
     # Policies of other versions of this package may have seen something else.
     seen = jax.ShapeDtypeStruct((config.navigation.observed.size,), jnp.float32)
-    like = jax.eval_shape(partial(_untrained, actor, critic), seen)
+    weights = _read(file, jax.eval_shape(partial(_untrained, actor, critic), seen), seed)
+    observations = RunningStatistics(*(weights[f"observation_{name}"] for name in _STATISTICS))
+    risk = None
+    if (place / _RISK).is_file():
+        like = jax.eval_shape(partial(Risk.untrained, config.risk_network), seen, jax.random.key(0))
+        risk = _read(place / _RISK, like, seed)
+    learned = DeterministicPolicy(actor, weights["actor"], observations, risk=risk)
+    value = Value(critic, weights["critic"], learned, weights["return_scale"])
+    return Policy(learned, value, config.controller, config)
+
+
+def _place(folder: Path) -> Path:
+    """The folder of the policy, given that or the folder of its run."""
+    inside = folder / FOLDER
+    return inside if inside.is_dir() else folder
+
+
+def _write(file: Path, arrays: Any) -> None:
+    stream = io.BytesIO()
+    np.savez(stream, **named_leaves(jax.device_get(arrays)))
+    atomic.write(file, stream.getvalue())
+
+
+def _read(file: Path, like: T, seed: int) -> T:
+    """The arrays of one seed; `CheckpointError` unless they have the shapes of `like`."""
+    refused = refusing(lambda found: CheckpointError(f"{file}: cannot read weights: {found}"))
+    with refused, np.load(file, allow_pickle=False) as stored:
+        arrays = {name: jnp.asarray(stored[name][seed]) for name in stored.files}
     names = named_leaves(like)
     for name, leaf in names.items():
         found = arrays[name].shape if name in arrays else "none"
@@ -219,21 +268,20 @@ def load_policy(folder: str | Path, seed: int = 0) -> Policy:
             raise CheckpointError(
                 f"{file}: {name}: expected shape {leaf.shape} as policy.yaml says, found {found}"
             )
-    weights = jax.tree.unflatten(jax.tree.structure(like), [arrays[name] for name in names])
-    observations = RunningStatistics(*(arrays[f"observation_{name}"] for name in _STATISTICS))
-    learned = DeterministicPolicy(actor, weights["actor"], observations)
-    value = Value(critic, weights["critic"], learned, arrays["return_scale"])
-    return Policy(learned, value, config.controller, config)
+    return jax.tree.unflatten(jax.tree.structure(like), [arrays[name] for name in names])
 
 
 def _untrained(
     actor: Actor | TanhNormalActor, critic: Critic, observation: jax.Array
 ) -> dict[str, Any]:
-    """Weights for observations of this shape."""
+    """All that `save` keeps, for observations of this shape."""
     key = jax.random.key(0)
     if isinstance(actor, Actor):
         critics = critic.init(key, observation)
     else:
         twins = jax.vmap(critic.init, (0, None, None))
         critics = twins(jax.random.split(key), observation, jnp.zeros(_ACTIONS))
-    return {"actor": actor.init(key, observation), "critic": critics}
+    statistics = RunningStatistics.create(observation.shape)
+    kept = {f"observation_{name}": getattr(statistics, name) for name in _STATISTICS}
+    kept |= {"actor": actor.init(key, observation), "critic": critics}
+    return kept | {"return_scale": jnp.float32(1)}

@@ -9,10 +9,10 @@ import numpy as np
 from vertiwm_jax.config import ConfigError
 from vertiwm_jax.dynamics import Dynamics, Params
 from vertiwm_jax.env import suites
-from vertiwm_jax.env.agent import Agent, Policy
+from vertiwm_jax.env.agent import Agent, Now, Policy
 from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.env.task import TaskParams, TaskState
+from vertiwm_jax.env.task import TaskParams
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.evaluation import prediction
 from vertiwm_jax.evaluation.prediction import Reading, TestWindows
@@ -64,9 +64,10 @@ def drive(
 ) -> Scene:
     """Drives the first task of the pool to its end; `name` is that of the agent, for the title."""
 
-    def shown(task: TaskParams, state: TaskState) -> tuple:
+    def shown(agent: Agent, now: Now) -> tuple:
         """Keeps the state, the command that led there, and what the model tells of itself."""
-        command = task.vehicle.command(state.action, env.config.speed_range).vector
+        state = now.state
+        command = now.task.vehicle.command(state.action, env.config.speed_range).vector
         return state.vehicle.vector, command, Reading.of(state.history)
 
     found = jax.tree.map(lambda x: np.asarray(x)[0], run_episodes(env, task, agent, key, shown))
