@@ -220,7 +220,8 @@ def test_a_run_is_evaluated_as_at_its_end(run, tmp_path, capsys):
 def test_controllers_and_runs_on_other_worlds(run, tmp_path, capsys, monkeypatch):
     navigate = ["navigation", "--policy"]
     maps(tmp_path / "maps", count=2)
-    door("evaluate")([*navigate, str(run), "--terrain", str(tmp_path / "maps")])
+    given = ["--planning", "False", "--terrain", str(tmp_path / "maps")]
+    door("evaluate")([*navigate, str(run), *given])
     said = capsys.readouterr().out
     assert "driving 4 tasks on 2 worlds" in said and "  straight to goal: " in said
     # The usual worlds are many.
@@ -338,7 +339,8 @@ def test_whether_a_policy_plans_can_be_asked_for(planning, run, tmp_path, monkey
 
 
 def test_a_policy_drives_another_vehicle(run, tmp_path, capsys):
-    navigate = ("navigation", "--policy", run, "--suites", "easy", "--output")
+    asked = ("--suites", "easy", "--planning", "False", "--output")
+    navigate = ("navigation", "--policy", run, *asked)
     door("evaluate")([*map(str, navigate), str(tmp_path / "hmmwv")])
     door("evaluate")([*map(str, navigate), str(tmp_path / "rover"), "--vehicle", "rover"])
     assert "| straight to goal" in capsys.readouterr().out

@@ -1,5 +1,7 @@
 """What is driven, where: another vehicle brings its shape, and its ground."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,6 +50,22 @@ def test_models_multiply_what_is_asked_or_faster(asked, faster, found, monkeypat
     _, params = experiment.dynamics(chosen, "nesam")
     half = any(leaf.dtype == jnp.bfloat16 for leaf in jax.tree.leaves(params))
     assert half == (found == "bfloat16")
+
+
+@pytest.mark.parametrize("weights", ["any_vehicle", "own/model"])
+def test_a_run_goes_on_from_other_folders(weights, monkeypatch):
+    class Loading(Exception):
+        pass
+
+    def load(config, model):
+        raise Loading(config.weights)
+
+    monkeypatch.setattr(experiment, "dynamics", load)
+    with pytest.raises(Loading) as found:
+        experiment.run(PPOTraining(weights=Path(weights)))
+    # A model that comes with the package may lie elsewhere then.
+    own = Path(weights).absolute()
+    assert found.value.args == (Path(weights) if weights == "any_vehicle" else own,)
 
 
 def test_a_vehicle_that_is_none_is_named(tmp_path):

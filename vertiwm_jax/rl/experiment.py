@@ -316,10 +316,11 @@ def run(
     the disk do not allow it, and `TrainingInterrupted` at Ctrl-C once all is saved.
     """
     Run.expect(config, config.wandb)
-    # So that it goes on as it began, and is tested, from wherever that is.
-    weights = config.weights and files.find(config.weights)
-    paths = {"terrain": config.terrain, "weights": weights}
-    absolute = {name: path and path.absolute() for name, path in paths.items()}
+    # So that it goes on as it began, and is tested, from wherever that is. Models that come along
+    # keep their names, as packages may be moved.
+    own = config.weights and files.find(config.weights) == config.weights
+    paths = {"terrain": config.terrain, "weights": config.weights if own else None}
+    absolute = {name: path.absolute() for name, path in paths.items() if path}
     config = replace(config, compute_dtype=config.fixed_dtype, **absolute)
     moves, weights = dynamics(config, config.model)
     _log.info("drawing worlds ...")
