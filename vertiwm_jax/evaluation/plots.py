@@ -107,7 +107,7 @@ def trajectories(
     """
     risks = risks or {}
     with figures.style():
-        figure = figures.sheet(9.0, 4.6)
+        figure = figures.sheet(9.0, 6.2 if risks else 4.6)
         grid = figure.add_gridspec(3 if risks else 2, 2, width_ratios=(1.1, 1))
         overhead = figure.add_subplot(grid[:, 0])
         roll = figure.add_subplot(grid[0, 1])
