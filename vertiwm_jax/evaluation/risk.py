@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
+from vertiwm_jax import atomic
 from vertiwm_jax.config import Count, settings
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Policy
@@ -54,6 +55,7 @@ class RiskTest:
         """Learns, tests, and writes what `output` asks for; returns tables as Markdown."""
         seeds = policy.load_policy(self.policy).config.seeds
         policies = [policy.load_policy(self.policy, seed) for seed in range(seeds)]
+        atomic.expect_folder(self.policy)
         config = experiment.load(self.policy / "config.yaml")
         given = experiment.training_ground(config)[:2]
         risks = []

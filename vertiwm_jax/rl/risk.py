@@ -26,6 +26,7 @@ from vertiwm_jax.errors import UserError
 from vertiwm_jax.networks.policy import Critic
 from vertiwm_jax.precision import float32
 from vertiwm_jax.rl.running_statistics import RunningStatistics
+from vertiwm_jax.runs import Progress
 from vertiwm_jax.state import STEP_SECONDS
 
 SECONDS = 3.0
@@ -69,24 +70,25 @@ class Risk:
 class Moments:
     """N moments of episodes in which a vehicle did not stand still.
 
-    seen: leaves `[N, ...]`, what was kept of each; failed: `[N]` bool, whether it failed within
-    `SECONDS`; world: `[N]`; task: `[N]`.
+    seen: `[N, O]` observations; failed: `[N]` bool, whether a failure came within `SECONDS`;
+    world, task: `[N]` their numbers.
     """
 
-    seen: Any
+    seen: np.ndarray
     failed: np.ndarray
     world: np.ndarray
     task: np.ndarray
 
     @classmethod
     def of(cls, found: NavigationResult, every: int) -> Self:
-        """Of episodes that kept pairs of anything and the steps stalled, one in `every` steps."""
+        """Of episodes that kept observations and the steps stalled, one in `every` steps."""
         seen, stalled = found.kept
         counts, failed = failing(*map(np.asarray, (found.ending, found.steps, stalled)))
         task, time = np.nonzero(counts[:, ::every])
         time = time * every
-        picked = jax.tree.map(lambda x: np.asarray(x)[task, time], seen)
-        return cls(picked, failed[task, time], np.asarray(found.world)[task], task)
+        return cls(
+            np.asarray(seen)[task, time], failed[task, time], np.asarray(found.world)[task], task
+        )
 
 
 def failing(
@@ -113,7 +115,7 @@ def failing(
 def watch(
     env: NavigationEnv, task: TaskParams, agent: Policy | Agent, key: jax.Array, every: int = 1
 ) -> Moments:
-    """Drives all tasks of a pool once; N moments with their observations `[N, O]`."""
+    """Drives all tasks of a pool once; its moments, one in `every` steps."""
     # Observations of all would fill gigabytes.
     together = machine.together(cpu=128, accelerator=1024)
 
@@ -125,9 +127,11 @@ def watch(
         episodes = run_episodes(env, some, agent, jax.random.fold_in(key, first), _observed)
         new = min(together, task.pool_size - first)
         moments = Moments.of(jax.tree.map(lambda x: np.asarray(x)[:new], episodes), every)
+        progress.advance(new)
         return replace(moments, task=moments.task + first)
 
-    turns = [turn(first) for first in range(0, task.pool_size, together)]
+    with Progress(task.pool_size, "tasks") as progress:
+        turns = [turn(first) for first in range(0, task.pool_size, together)]
     return jax.tree.map(lambda *x: np.concatenate(x), *turns)
 
 
