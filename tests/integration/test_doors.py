@@ -313,7 +313,7 @@ def test_a_policy_of_a_known_map_drives_on_one_that_is_revealed(run, monkeypatch
     navigate = ["navigation", "--policy", str(run), "--suites", "easy", "--sensing-range", "12"]
     with pytest.raises(Driven) as found:
         door("evaluate")(navigate)
-    env, params, policy, _ = found.value.args
+    env, params, policy, *_ = found.value.args
     assert env.config.sensing.range == 12.0 and params.starts.observed is not None
     assert policy.base is not None
 

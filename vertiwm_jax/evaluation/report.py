@@ -304,6 +304,7 @@ def summary(groups: Mapping[str, Results]) -> dict[str, dict[str, dict[str, Any]
 
 def _episodes(groups: Mapping[str, Results], terrain: TerrainMap) -> list[tables.Row]:
     """A row for each episode, in the coordinates of the file of its map."""
+    told = any(x.kept is not None for results in groups.values() for x in results.values())
     return [
         {
             "suite": suite,
@@ -317,9 +318,14 @@ def _episodes(groups: Mapping[str, Results], terrain: TerrainMap) -> list[tables
             "abs_pitch_deg": math.degrees(float(result.abs_pitch[i])),
             "driven_m": float(result.driven[i]),
             "final_distance_m": float(result.final_distance[i]),
-            "highest_risk": "" if result.kept is None else float(result.kept[i].max()),
         }
+        | ({"highest_risk": _highest(result, i)} if told else {})
         for suite, results in groups.items()
         for policy, result in results.items()
         for i in range(len(result.ending))
     ]
+
+
+def _highest(result: NavigationResult, episode: int) -> float | str:
+    """The highest risk of an episode, where a policy foretells it."""
+    return "" if result.kept is None else float(result.kept[episode].max())
