@@ -61,7 +61,7 @@ def test_every_task_is_watched_once(monkeypatch):
     env, task = bicycle_env(ground(hills()), circle_tasks(ground(), 26.0, 3), CONFIG)
     policy, key = StraightToGoal(CONFIG), jax.random.key(0)
     episodes = run_episodes(env, task, policy, key)
-    found = watch(env, task, policy, key)
+    found = watch(env, task, policy, key, every=1)
     # All of them start from rest, but none stands still for a second.
     assert np.bincount(found.task).tolist() == np.asarray(episodes.steps).tolist()
     assert found.seen.shape == (len(found.task), env.config.observed.size)
@@ -106,3 +106,9 @@ def test_what_never_varies_is_refused(failed):
     few = drawn(100, 0)[0]
     with pytest.raises(UserError, match=f"found {100 * failed} failures in 100 moments"):
         learn(replace(few, failed=np.full(100, failed)), Critic((8,)), jax.random.key(0))
+
+
+def test_fewer_than_five_tasks_are_refused():
+    few = drawn(100, 0)[0]
+    with pytest.raises(UserError, match="in 100 moments of 4 tasks"):
+        learn(replace(few, world=few.world % 3, task=few.task % 4), Critic((8,)), jax.random.key(0))

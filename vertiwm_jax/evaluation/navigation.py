@@ -69,16 +69,13 @@ def summary(result: NavigationResult) -> dict[str, Any]:
         driven: m, mean over all episodes.
         endings: how often each termination reason came, by name.
     """
-    from scipy.stats import binomtest
-
     success, steps = np.asarray(result.success), np.asarray(result.steps)
     successes, seconds = int(success.sum()), np.asarray(result.seconds)[success]
-    interval = binomtest(successes, len(success)).proportion_ci(method="wilson")
     counts = np.bincount(np.asarray(result.ending), minlength=len(TerminationReason))
     return {
         "tasks": len(success),
         "successes": successes,
-        "success_interval": (float(interval.low), float(interval.high)),
+        "success_interval": wilson(success),
         "seconds": float(seconds.mean()) if successes else None,
         "seconds_deviation": float(seconds.std()) if successes else None,
         "abs_roll": float(np.average(result.abs_roll, weights=steps)),
@@ -86,6 +83,14 @@ def summary(result: NavigationResult) -> dict[str, Any]:
         "driven": float(np.mean(result.driven)),
         "endings": {e.name.lower(): int(counts[e]) for e in TerminationReason if counts[e]},
     }
+
+
+def wilson(holds: np.ndarray) -> tuple[float, float]:
+    """The 95 % interval, after Wilson, of how often something holds, by samples `[N]` of it."""
+    from scipy.stats import binomtest
+
+    interval = binomtest(int(holds.sum()), len(holds)).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def format_table(summaries: Mapping[str, Mapping[str, Any]]) -> str:

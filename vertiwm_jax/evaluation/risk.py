@@ -16,6 +16,7 @@ from vertiwm_jax.config import Count, settings
 from vertiwm_jax.env import suites
 from vertiwm_jax.env.agent import Policy
 from vertiwm_jax.env.suites import Tasks
+from vertiwm_jax.evaluation.navigation import wilson
 from vertiwm_jax.evaluation.tables import Row, markdown, write
 from vertiwm_jax.figures import line, sheet, style
 from vertiwm_jax.rl import experiment, policy
@@ -152,13 +153,10 @@ def _ranges(probability: np.ndarray, failed: np.ndarray) -> list[tuple]:
 
     Intervals are of 95 %, after Wilson.
     """
-    from scipy.stats import binomtest
-
     range_of = np.digitize(probability, EDGES[1:-1])
     found = []
     for number in np.unique(range_of):
         some, part = failed[range_of == number], probability[range_of == number]
-        interval = binomtest(int(some.sum()), len(some)).proportion_ci(method="wilson")
-        ends = interval.low, interval.high
-        found.append((int(number), len(some), float(part.mean()), float(some.mean()), ends))
+        means = float(part.mean()), float(some.mean())
+        found.append((int(number), len(some), *means, wilson(some)))
     return found

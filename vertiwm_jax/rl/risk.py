@@ -18,7 +18,7 @@ from flax import struct
 
 from vertiwm_jax import machine
 from vertiwm_jax.env.agent import Agent, Now, Policy
-from vertiwm_jax.env.episodes import NavigationResult, run_episodes
+from vertiwm_jax.env.episodes import run_episodes
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import TaskParams
 from vertiwm_jax.env.termination import TerminationReason
@@ -79,17 +79,6 @@ class Moments:
     world: np.ndarray
     task: np.ndarray
 
-    @classmethod
-    def of(cls, found: NavigationResult, every: int) -> Self:
-        """Of episodes that kept observations and the steps stalled, one in `every` steps."""
-        seen, stalled = found.kept
-        counts, failed = failing(*map(np.asarray, (found.ending, found.steps, stalled)))
-        task, time = np.nonzero(counts[:, ::every])
-        time = time * every
-        return cls(
-            np.asarray(seen)[task, time], failed[task, time], np.asarray(found.world)[task], task
-        )
-
 
 def failing(
     ending: np.ndarray, steps: np.ndarray, stalled: np.ndarray
@@ -113,7 +102,7 @@ def failing(
 
 
 def watch(
-    env: NavigationEnv, task: TaskParams, agent: Policy | Agent, key: jax.Array, every: int = 1
+    env: NavigationEnv, task: TaskParams, agent: Policy | Agent, key: jax.Array, every: int
 ) -> Moments:
     """Drives all tasks of a pool once; its moments, one in `every` steps."""
     # Observations of all would fill gigabytes.
@@ -124,11 +113,17 @@ def watch(
         rows = np.arange(first, first + together) % task.pool_size
         starts, seen = jax.tree.map(lambda x: x[rows], (task.starts, task.start_observation))
         some = replace(task, starts=starts, start_observation=seen)
-        episodes = run_episodes(env, some, agent, jax.random.fold_in(key, first), _observed)
+        found = run_episodes(env, some, agent, jax.random.fold_in(key, first), _observed)
         new = min(together, task.pool_size - first)
-        moments = Moments.of(jax.tree.map(lambda x: np.asarray(x)[:new], episodes), every)
+        observation, stalled = found.kept
+        ended = found.ending, found.steps, stalled, found.world
+        ending, steps, stalled, world = (np.asarray(x)[:new] for x in ended)
+        counts, failed = (x[:, ::every] for x in failing(ending, steps, stalled))
+        number, time = np.nonzero(counts)
+        # Thinned out where it is: most of it is not needed.
+        seen = np.asarray(observation[:new, ::every])[number, time]
         progress.advance(new)
-        return replace(moments, task=moments.task + first)
+        return Moments(seen, failed[number, time], world[number], first + number)
 
     with Progress(task.pool_size, "tasks") as progress:
         turns = [turn(first) for first in range(0, task.pool_size, together)]
@@ -142,16 +137,19 @@ def _observed(agent: Agent, now: Now) -> tuple[jax.Array, jax.Array]:
 def learn(moments: Moments, network: Critic, key: jax.Array) -> Risk:
     """Learns from moments with observations `[N, O]` how likely failures are.
 
-    Raises `UserError` where the vehicle never failed, or always.
+    Raises `UserError` where the vehicle never failed, or always, or drove fewer than five tasks.
     """
     failed = moments.failed
-    if failed.all() or not failed.any():
+    group = np.unique(moments.world, return_inverse=True)[1]
+    if group.max() < 4:  # So few worlds that tasks have to do.
+        group = np.unique(moments.task, return_inverse=True)[1]
+    kept = group % 5 == 4
+    if failed.all() or not failed.any() or not kept.any():
         raise UserError(
-            f"expected moments before failures and others, found {failed.sum()} failures in "
-            f"{len(failed)} moments; drive other tasks, or more of them"
+            "expected moments of five tasks or more, before failures and others, found "
+            f"{failed.sum()} failures in {len(failed)} moments of {len(np.unique(moments.task))} "
+            "tasks; drive other tasks, or more of them"
         )
-    groups = moments.world if len(np.unique(moments.world)) >= 5 else moments.task
-    kept = groups % 5 == 4
     shares = [f"{x.sum():,} ({moments.failed[x].mean():.2%})" for x in (~kept, kept)]
     _log.info("learning from %s moments (failures), stopping by %s ...", *shares)
     first, key = jax.random.split(key)
