@@ -2,7 +2,8 @@
 
 A start is bogged if the vehicle moves less than 1 m in 10 s of full speed ahead, however it steers.
 It has freed itself if within 15 s it gets 5 m away without rolling over. `--policies RUN ...` adds
-trained policies to the controllers.
+trained policies to the controllers and to MPPI, which plans inside NeSAM and, for the most that
+planning can gain, inside the simulator of the test itself.
 """
 
 from dataclasses import replace
@@ -24,6 +25,8 @@ from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import load_vehicle
+from vertiwm_jax.models.registry import load_model
+from vertiwm_jax.planning.mppi import MPPI
 from vertiwm_jax.rl.policy import load_policy
 from vertiwm_jax.terrain.map import TerrainMap
 
@@ -95,6 +98,10 @@ def main() -> None:
         "look ahead, forwards only": (FORWARDS, LookAhead(FORWARDS)),
         "look ahead": (BOTH_WAYS, LookAhead(BOTH_WAYS)),
     }
+    for name in ("nesam", "builtin"):
+        model, params = load_model(name)
+        planner = MPPI(env=NavigationEnv(model, BOTH_WAYS), dynamics=params)
+        drivers[f"MPPI in {name}"] = BOTH_WAYS, planner
     for run in chosen.policies:
         policy = load_policy(run)
         patient = replace(policy.task, horizon_seconds=15.0, stuck_seconds=20.0)

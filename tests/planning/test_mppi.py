@@ -108,7 +108,7 @@ def test_a_plan_without_alternatives_is_kept_and_moves_on(blocked):
 @pytest.mark.integration
 def test_plans_count_by_what_they_return(blocked, temperature):
     env, params = blocked
-    planner = driver(env, temperature=temperature)
+    planner = driver(env, temperature=temperature, spread=0.5)
     noise_key, key = jax.random.split(KEY)
     noise = jax.random.normal(noise_key, (16, 4, 2)).at[0].set(0.0)
     plans = jnp.clip(0.5 * noise, -1.0, 1.0)
@@ -140,6 +140,24 @@ def test_after_a_plan_it_goes_on_to_the_goal_at_a_steady_pace(blocked):
 
 
 @pytest.mark.integration
+def test_tilting_costs_what_the_planner_says():
+    """On a slope to the side that costs nothing in the task itself."""
+    bank = 0.45
+    slope = np.tan(bank) * np.arange(129.0)[:, None] * np.ones(129)
+    env = NavigationEnv(KinematicBicycle(), CONFIG)
+    params = env.make_params(BICYCLE, ground(slope), task((-40.0, 0.0), (40.0, 0.0)))
+    now, straight = begin(env, params), jnp.zeros((4, 2))
+    careless, careful = (
+        float(driver(env, tilt=tilt, tilt_limit=0.3).imagine(now, straight, KEY))
+        for tilt in (0.0, 200.0)
+    )
+    of_decision = 8 * 200 * bank / 0.3 * (bank - 0.3)
+    expected = of_decision * sum(0.98**number for number in range(4))
+    assert careless - careful == pytest.approx(expected, rel=0.03)
+    assert env.config.reward.tilt_limit > bank
+
+
+@pytest.mark.integration
 def test_many_decide_as_each_alone(blocked):
     env, params = blocked
     planner = driver(env)
@@ -163,6 +181,8 @@ def test_many_decide_as_each_alone(blocked):
         ("interval", 0, "at least 1"),
         ("spread", -0.1, "at least 0"),
         ("temperature", 0.0, "more than 0"),
+        ("tilt", -1.0, "at least 0"),
+        ("tilt_limit", 0.0, "more than 0"),
         ("pace", 0.0, "more than 0"),
         ("discount", 1.0, "between 0 and 1"),
     ],

@@ -1,10 +1,13 @@
 """Planning without a learned policy: model predictive path integral control."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vertiwm_jax.config import Positive, settings
+from vertiwm_jax.config import NotNegative, Positive, settings
+from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.planning.planner import OpenLoopConfig, OpenLoopPlanner
 
 
@@ -12,8 +15,15 @@ from vertiwm_jax.planning.planner import OpenLoopConfig, OpenLoopPlanner
 class MPPIConfig(OpenLoopConfig):
     """What `MPPI` imagines before it decides, and what it makes of it."""
 
+    spread: NotNegative = 1.0
+    """Wide enough that plans to back up are among those drawn while it drives ahead."""
     temperature: Positive = 30.0
     """Reward by which a plan must be worse to count e times less."""
+    tilt: NotNegative = 200.0
+    """What roll and pitch beyond `tilt_limit` cost in imagination, in place of the task's weight.
+    It is much, because the model may be wrong about a plan that barely stays upright."""
+    tilt_limit: Positive = 0.3
+    """Roll and pitch that cost nothing, rad."""
 
 
 @struct.dataclass
@@ -27,6 +37,14 @@ class MPPI(OpenLoopPlanner):
     """
 
     config: MPPIConfig = struct.field(pytree_node=False, default=MPPIConfig())
+
+    @property
+    def imagined(self) -> NavigationEnv:
+        """The task as it is imagined, where tilting costs what the planner says."""
+        task = self.env.config
+        costs = {"tilt": self.config.tilt, "tilt_limit": self.config.tilt_limit}
+        cautious = replace(task, reward=replace(task.reward, **costs))
+        return replace(super().imagined, config=cautious)
 
     def chosen(self, plans: jax.Array, returns: jax.Array) -> jax.Array:
         """`[D, 2]` the mean of the plans."""

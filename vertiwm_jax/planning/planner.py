@@ -66,6 +66,11 @@ class Planner(Agent):
     dynamics: Params
     config: PlannerConfig = struct.field(pytree_node=False)
 
+    @property
+    def imagined(self) -> NavigationEnv:
+        """The task as it is imagined: decisions are held, and correct the base."""
+        return replace(self.env, action_repeat=self.interval, base=self.base)
+
     def intended(self, now: Now, memory: Plan) -> jax.Array:
         """`[K, 2]` the plan about which others are drawn.
 
@@ -126,7 +131,7 @@ class Planner(Agent):
         Episodes end in imagination as they do in truth: a plan that fails forgoes all that would
         have come.
         """
-        env = replace(self.env, action_repeat=self.interval, base=self.base)
+        env = self.imagined
 
         def advance(carry: tuple, inputs: tuple[jax.Array, jax.Array]) -> tuple[tuple, None]:
             (observation, state, weight, total), (number, key) = carry, inputs
