@@ -15,6 +15,7 @@ from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
+from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.planning.mppi import MPPI, MPPIConfig
 from vertiwm_jax.terrain.sensing import SensingConfig
 
@@ -108,7 +109,7 @@ def test_a_plan_without_alternatives_is_kept_and_moves_on(blocked):
 @pytest.mark.integration
 def test_plans_count_by_what_they_return(blocked, temperature):
     env, params = blocked
-    planner = driver(env, temperature=temperature, spread=0.5)
+    planner = driver(env, temperature=temperature, spread=0.5, clearance=0.0)
     noise_key, key = jax.random.split(KEY)
     noise = jax.random.normal(noise_key, (16, 4, 2)).at[0].set(0.0)
     plans = jnp.clip(0.5 * noise, -1.0, 1.0)
@@ -158,6 +159,25 @@ def test_tilting_costs_what_the_planner_says():
 
 
 @pytest.mark.integration
+@pytest.mark.parametrize(("start", "fails"), [(-12.0, True), (0.0, False)])
+def test_plans_keep_clear_of_obstacles_unless_too_near_already(start, fails):
+    """Of a wall that it passes 0.2 m from its side, or beside which it stands."""
+    aside = float(load_vehicle().width) / 2 + 1.5 + 0.2
+    env = NavigationEnv(KinematicBicycle(), CONFIG)
+    params = env.make_params(
+        BICYCLE, ground(obstacles=[[0.0, 0.0, 2.0, 3.0, 2.0]]), task((start, aside), (30.0, aside))
+    )
+    now, straight = begin(env, params), jnp.zeros((8, 2))
+
+    def imagined(clearance):
+        planner = driver(env, decisions=8, clearance=clearance)
+        return float(planner.imagine(planner.inside(now, planner.init(now)), straight, KEY))
+
+    lost = imagined(0.0) - imagined(0.3)
+    assert lost > env.config.reward.failure if fails else lost == 0
+
+
+@pytest.mark.integration
 def test_many_decide_as_each_alone(blocked):
     env, params = blocked
     planner = driver(env)
@@ -183,6 +203,7 @@ def test_many_decide_as_each_alone(blocked):
         ("temperature", 0.0, "more than 0"),
         ("tilt", -1.0, "at least 0"),
         ("tilt_limit", 0.0, "more than 0"),
+        ("clearance", -0.1, "at least 0"),
         ("pace", 0.0, "more than 0"),
         ("discount", 1.0, "between 0 and 1"),
     ],

@@ -7,8 +7,11 @@ import jax.numpy as jnp
 from flax import struct
 
 from vertiwm_jax.config import NotNegative, Positive, settings
+from vertiwm_jax.env.agent import Now
 from vertiwm_jax.env.navigation import NavigationEnv
-from vertiwm_jax.planning.planner import OpenLoopConfig, OpenLoopPlanner
+from vertiwm_jax.env.route import CLEARANCE
+from vertiwm_jax.planning.planner import OpenLoopConfig, OpenLoopPlanner, Plan
+from vertiwm_jax.terrain import obstacles
 
 
 @settings
@@ -24,6 +27,8 @@ class MPPIConfig(OpenLoopConfig):
     It is much, because the model may be wrong about a plan that barely stays upright."""
     tilt_limit: Positive = 0.3
     """Roll and pitch that cost nothing, rad."""
+    clearance: NotNegative = CLEARANCE
+    """How far, in m, plans keep from obstacles, unless the vehicle is nearer already."""
 
 
 @struct.dataclass
@@ -45,6 +50,19 @@ class MPPI(OpenLoopPlanner):
         costs = {"tilt": self.config.tilt, "tilt_limit": self.config.tilt_limit}
         cautious = replace(task, reward=replace(task.reward, **costs))
         return replace(super().imagined, config=cautious)
+
+    def inside(self, now: Now, memory: Plan) -> Now:
+        """The task as it is now, inside the model, for a vehicle made larger by the clearance."""
+        imagined = super().inside(now, memory)
+        task, driven = imagined.task, now.state.vehicle
+        vehicle, more = task.vehicle, 2 * self.config.clearance
+        size = jnp.stack([vehicle.length, vehicle.width])
+        pose = driven.position[:2], driven.rpy[2]
+        # Too near already, every plan would end at once, and none be better than another.
+        near = obstacles.collides(task.terrain, *pose, *(size + more))
+        length, width = jnp.where(near, size, size + more)
+        larger = replace(vehicle, length=length, width=width)
+        return replace(imagined, task=replace(task, vehicle=larger))
 
     def chosen(self, plans: jax.Array, returns: jax.Array) -> jax.Array:
         """`[D, 2]` the mean of the plans."""
