@@ -53,8 +53,8 @@ class MPPI(OpenLoopPlanner):
 
     def inside(self, now: Now, memory: Plan) -> Now:
         """The task as it is now, inside the model, for a vehicle made larger by the clearance."""
-        imagined = super().inside(now, memory)
-        task, driven = imagined.task, now.state.vehicle
+        now = super().inside(now, memory)
+        task, driven = now.task, now.state.vehicle
         vehicle, more = task.vehicle, 2 * self.config.clearance
         size = jnp.stack([vehicle.length, vehicle.width])
         pose = driven.position[:2], driven.rpy[2]
@@ -62,7 +62,7 @@ class MPPI(OpenLoopPlanner):
         near = obstacles.collides(task.terrain, *pose, *(size + more))
         length, width = jnp.where(near, size, size + more)
         larger = replace(vehicle, length=length, width=width)
-        return replace(imagined, task=replace(task, vehicle=larger))
+        return replace(now, task=replace(task, vehicle=larger))
 
     def chosen(self, plans: jax.Array, returns: jax.Array) -> jax.Array:
         """`[D, 2]` the mean of the plans."""
