@@ -24,7 +24,6 @@ from vertiwm_jax.env.task import TaskParams
 from vertiwm_jax.mechanics.simulator import chrono_like
 from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models import files
-from vertiwm_jax.models.config import Size
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.networks.specialist import ComputeDtype
 from vertiwm_jax.rl import experiment
@@ -90,7 +89,7 @@ def main() -> None:
     arguments = parser(__doc__)
     arguments.add_argument("--configs", nargs="+", default=("ppo", "paper/ppo"))
     arguments.add_argument("--models", nargs="+", default=("builtin", "vertiwm"))
-    arguments.add_argument("--size", choices=get_args(Size), default="base", help="of Verti-WM")
+    arguments.add_argument("--size", choices=("base", "paper"), default="base", help="of Verti-WM")
     arguments.add_argument(
         "--compute-dtype",
         nargs="+",

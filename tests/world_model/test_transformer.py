@@ -20,7 +20,7 @@ from world_model.examples import (
 
 from vertiwm_jax.dynamics import along, rollout, warm_up
 from vertiwm_jax.mechanics.vehicle import load_vehicle
-from vertiwm_jax.networks.specialist import BASE, PAPER, WINDOW
+from vertiwm_jax.networks.specialist import BASE, PAPER, PAPER_WHOLE, WINDOW
 from vertiwm_jax.perception.features import init_pair, init_reduce
 from vertiwm_jax.perception.perceive import perceive
 from vertiwm_jax.state import Command, VehicleState
@@ -63,13 +63,14 @@ predicted = jax.jit(predict, static_argnames="model")
 
 
 def test_sizes():
-    base, paper = (
+    base, paper, whole = (
         count(jax.eval_shape(Transformer(size).init_params, KEY).network)
         + count(init_reduce(KEY, size.channels))
-        for size in (BASE, PAPER)
+        for size in (BASE, PAPER, PAPER_WHOLE)
     )
     assert 500_000 < base < 700_000
     assert paper == pytest.approx((9_972_634 - 33_764) / 2, rel=0.03)
+    assert whole == pytest.approx(9_871_128, rel=0.03)
 
 
 def test_starts_from_the_mean_transition():

@@ -7,7 +7,7 @@ import jax
 
 from vertiwm_jax.config import AtLeastOne, Count, settings
 from vertiwm_jax.mechanics.simulator import SimulatorParams
-from vertiwm_jax.networks.specialist import BASE, PAPER, NetworkSize
+from vertiwm_jax.networks.specialist import BASE, PAPER, PAPER_WHOLE, NetworkSize
 from vertiwm_jax.perception.features import Encoders, init_pair, init_reduce, init_soil
 from vertiwm_jax.world_model.fusion import Coefficients, GateParams, GateTerrain
 from vertiwm_jax.world_model.nesam import Nesam
@@ -16,9 +16,9 @@ from vertiwm_jax.world_model.transformer import Ground, Transformer
 from vertiwm_jax.world_model.verti_wm import VertiWM, VertiWMParams
 
 Part = Literal["transformer", "nesam", "gate"]
-Size = Literal["base", "paper"]
+Size = Literal["base", "paper", "paper_whole"]
 SoilSource = Literal["map", "predicted"]
-_SIZES: dict[Size, NetworkSize] = {"base": BASE, "paper": PAPER}
+_SIZES: dict[Size, NetworkSize] = {"base": BASE, "paper": PAPER, "paper_whole": PAPER_WHOLE}
 
 
 @settings
@@ -28,7 +28,8 @@ class ModelConfig:
     parts: Annotated[tuple[Part, ...], AtLeastOne] = ("transformer", "nesam", "gate")
     """What of it is fitted; each part can be used alone, the gate needs both others."""
     size: Size = "base"
-    """Of both specialists' networks."""
+    """Of each specialist's network: the package's own; half of the paper's parameters, as its
+    specialists have; or all of them, as its Transformers that learn from everything."""
     terrain: Ground = "patches"
     """What the Transformer is told of the ground; less than patches only to compare with."""
     soil: SoilSource = "map"

@@ -1,7 +1,7 @@
 """The network of both specialists: tokens of past steps through a cached causal Transformer."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
 import flax.linen as nn
@@ -42,6 +42,8 @@ BASE = NetworkSize(layers=3, width=128, heads=4, hidden=256, channels=8)
 """The shipped default."""
 PAPER = NetworkSize(layers=3, width=320, heads=10, hidden=1280, channels=16)
 """Half of the paper's 9,972,634 parameters of dynamics."""
+PAPER_WHOLE = replace(PAPER, layers=7)
+"""All of them in one network, as in the paper's Transformers that learn from everything."""
 
 
 class SpecialistNetwork(nn.Module):
