@@ -40,11 +40,7 @@ def main() -> None:
     dynamics, weights = experiment.dynamics(config, config.model)
     env = experiment.env_of(config, config.model, dynamics, config.variation)
     algorithm = Seeds(config.algorithm(env), config.loop.seeds)
-    encoders = experiment.encoders(config)
-    shapes = env.make_params(weights, terrain, pool, encoders=encoders, settled=False)
-    training.compiled(algorithm, shapes)
-    results["compiled"] = {"most_MB": most()}
-    made = env.make_params(weights, terrain, pool, encoders=encoders)
+    made = env.make_params(weights, terrain, pool, encoders=experiment.encoders(config))
     params = jax.block_until_ready(made)
     results["worlds and starts"] = {
         "most_MB": most(),
@@ -53,7 +49,8 @@ def main() -> None:
     }
     machine.forget_programs()
     state = training.begin(algorithm, params, config.key("training"))
-    iterate, mesh = training.compiled(algorithm, params), algorithm.mesh
+    iterate, mesh = training.compiled(algorithm, params, state), algorithm.mesh
+    results["compiled"] = {"most_MB": most()}
     params = parallel.place(mesh, params)
     state = parallel.place(mesh, state, algorithm.specs)
     machine.release_memory()

@@ -14,7 +14,7 @@ import pytest
 from flax import struct
 from jax.sharding import Mesh
 
-from vertiwm_jax import kept, runs
+from vertiwm_jax import kept, machine, runs, xla
 from vertiwm_jax.env import controllers
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.observation import ARCS
@@ -132,6 +132,88 @@ def test_those_used_longest_ago_go(folder, monkeypatch):
         os.utime(file, (1e9 - age, 1e9 - age))
     assert not doubled(1) and doubled(3)  # 2 is the older one now.
     assert not doubled(1) and doubled(2)
+
+
+traced = []
+
+
+@partial(kept.jit, static_argnames="times")
+def multiplied(x, times=2):
+    traced.append(times)
+    return {"product": times * x["factor"]}
+
+
+@pytest.fixture
+def tracings(folder, monkeypatch):
+    """Of `multiplied`, where programs are kept."""
+    monkeypatch.setattr(xla, "_keeps", True)
+    monkeypatch.setattr(kept, "_KNOWN", kept._KNOWN | {__name__.split(".")[0]})
+    traced.clear()
+    yield traced
+    kept.forget()
+
+
+def test_a_later_process_does_not_trace_a_brief_program(folder, tracings):
+    def product(x, *times):
+        return multiplied({"factor": jnp.asarray(x)}, *times)["product"].tolist()
+
+    assert product([1.0, 2.0]) == [2, 4] and product([3.0, 4.0]) == [6, 8] and tracings == [2]
+    machine.forget_programs()
+    assert product([5.0, 6.0]) == [10, 12] and product([1.0, 1.0], 2) == [2, 2]
+    assert tracings == [2] and len([*folder.iterdir()]) == 1
+    # Other numbers of other types or with other settings are other programs.
+    assert product([1, 2]) == [2, 4] and product([1.0, 2.0, 3.0]) == [2, 4, 6]
+    assert product([1.0, 2.0], 3) == [3, 6] and tracings == [2, 2, 2, 3]
+
+
+def test_brief_programs_follow_their_arguments_to_devices(folder, tracings):
+    first, second = jax.devices()[:2]
+    for device in (first, second):
+        given = jax.device_put(jnp.ones(2), device)
+        assert multiplied({"factor": given})["product"].devices() == {device}
+    mesh = Mesh(np.array([first, second]), ("batch",))
+    rows = jax.NamedSharding(mesh, jax.P("batch"))
+    for _ in range(2):
+        with jax.set_mesh(mesh):
+            product = multiplied({"factor": jax.device_put(jnp.arange(2.0), rows)})["product"]
+        assert product.sharding == rows and product.tolist() == [0, 2]
+        assert len([*folder.iterdir()]) == 3
+        machine.forget_programs()
+
+
+def test_a_brief_program_is_kept_only_if_asked(folder, tracings, monkeypatch):
+    monkeypatch.setattr(xla, "_keeps", False)
+    assert multiplied({"factor": jnp.float32(2)})["product"] == 4 and not folder.exists()
+
+
+def test_a_brief_program_has_its_own_options_too():
+    brief = kept.jit(lambda x: 2 * x, compiler_options={"xla_no_such_option": 1})
+    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such_option"):
+        brief(jnp.float32(1))
+
+
+SOLVE = """
+import sys
+import jax, jax.numpy as jnp
+from jax.sharding import Mesh
+from vertiwm_jax import kept, xla
+
+xla.keep_compiled()
+mesh, ones = Mesh(jax.devices()[:1], ("one",)), jnp.ones((2, 2)) + jnp.eye(2)
+solve = jax.jit(lambda x: jnp.linalg.inv(x) @ jnp.linalg.qr(x)[0])
+print(kept.program("solve", mesh, lambda: print("compiled") or solve.lower(ones).compile())(ones))
+"""
+
+
+def test_a_program_that_calls_lapack_is_found(tmp_path):
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
+
+    def solve():
+        command = [sys.executable, "-c", SOLVE]
+        return subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+
+    first, second = solve().stdout, solve().stdout
+    assert first == "compiled\n" + second
 
 
 TRAIN = """

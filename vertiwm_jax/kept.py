@@ -9,28 +9,34 @@ import dataclasses
 import functools
 import hashlib
 import importlib.metadata
+import inspect
 import os
 import pickle
 import platform
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.experimental import serialize_executable
 from jax.sharding import Mesh
 
 from vertiwm_jax import atomic, xla
 
+T = TypeVar("T")
+
 _PACKAGE = Path(__file__).parent
 _DEPENDENCIES = "chex", "flax", "gymnax", "jax", "jaxlib", "jaxlie", "numpy", "optax"
 _KNOWN = {_PACKAGE.name, "builtins", "functools", *_DEPENDENCIES}
 """Where all that decides a program may come from: this source, and packages of known versions."""
-_PROGRAMS = 8
-"""How many are kept, 10 MB each; of more, those used longest ago go."""
+_PROGRAMS = 64
+"""How many are kept, of up to 10 MB each; of more, those used longest ago go."""
+_held: dict[Any, jax.stages.Compiled] = {}
+"""Programs of `jit` in this process."""
 
 
 class _CannotTell(Exception):
@@ -59,6 +65,68 @@ def program(
     with contextlib.suppress(Exception):
         _keep(file, made)
     return made
+
+
+def jit(
+    function: Callable[..., T],
+    *,
+    static_argnames: str | tuple[str, ...] = (),
+    brief: bool = True,
+    compiler_options: Mapping[str, int] = types.MappingProxyType({}),
+) -> Callable[..., T]:
+    """`jax.jit` for a program of the start of a training, which later processes need not trace.
+
+    brief: whether it runs only briefly, and is therefore compiled in about half the time; loops
+        that use vector units run many times slower in it. compiler_options: are added.
+    """
+    names = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
+    signature = inspect.signature(function)
+
+    @functools.cache  # To ask for options starts JAX, which is too early where this is imported.
+    def jitted() -> Any:
+        options = {**(xla.brief_options() if brief else {}), **compiler_options}
+        return jax.jit(function, static_argnames=names, compiler_options=options)
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> T:
+        given = signature.bind(*args, **kwargs)
+        given.apply_defaults()
+        static = {name: given.arguments[name] for name in names}
+        varied = {name: x for name, x in given.arguments.items() if name not in static}
+        leaves, kind = jax.tree.flatten(varied)
+        mesh = _mesh(leaves) if xla.keeps_compiled() else None
+        if mesh is None:
+            return jitted()(**given.arguments)
+        kinds = tuple(map(_kind, leaves))
+        key = function, tuple(static.values()), kind, kinds, mesh
+        if key not in _held:
+            decided_by = function, static, brief, dict(compiler_options), str(kind), kinds
+            lowered = functools.partial(jitted().lower, **given.arguments)
+            _held[key] = program(decided_by, mesh, lambda: lowered().compile())
+        return _held[key](**varied)
+
+    return call
+
+
+def _mesh(leaves: list[Any]) -> Mesh | None:
+    """The devices of a program with such arguments, or None where no mesh has those of all."""
+    mesh = jax.sharding.get_mesh()
+    if not mesh.empty:
+        return mesh
+    arrays = [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
+    devices = {device for array in arrays for device in array.devices()} or set(jax.devices()[:1])
+    return Mesh(np.array([*devices]), ("one",)) if len(devices) == 1 else None
+
+
+def _kind(leaf: Any) -> tuple[Any, ...]:
+    """All of an argument that decides a program."""
+    of = jax.typeof(leaf)
+    return of.shape, str(of.dtype), of.weak_type, str(getattr(leaf, "sharding", None))
+
+
+def forget() -> None:
+    """Gives back the memory of the programs of `jit`."""
+    _held.clear()
 
 
 def identity(x: Any) -> Any:
@@ -126,7 +194,14 @@ def _source() -> tuple[str, ...]:
     return digest.hexdigest(), *versions
 
 
+@functools.cache
+def _initialize_lapack() -> None:
+    """As lowering does; a program that calls it would end a process that has lowered nothing."""
+    jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), jnp.float32))
+
+
 def _load(file: Path, mesh: Mesh) -> jax.stages.Compiled:
+    _initialize_lapack()
     devices = mesh.devices.flatten().tolist()
     parts = pickle.loads(file.read_bytes())
     found = serialize_executable.deserialize_and_load(

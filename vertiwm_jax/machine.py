@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax import hosts, xla
+from vertiwm_jax import hosts, kept, xla
 from vertiwm_jax.errors import UserError
 
 _PATIENCE = 7 * 24 * 3600  # seconds
@@ -112,6 +112,7 @@ def forget_programs() -> None:
     What is held as compiled, as by `training.compiled`, stays.
     """
     jax.clear_caches()
+    kept.forget()
     release_memory()
 
 

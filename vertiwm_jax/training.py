@@ -18,7 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
-from vertiwm_jax import checkpoints, hosts, kept, machine, parallel, xla
+from vertiwm_jax import checkpoints, hosts, kept, machine, parallel
 from vertiwm_jax.config import Count, settings
 from vertiwm_jax.errors import TrainingInterrupted, UserError
 from vertiwm_jax.runs import Progress, Run
@@ -154,22 +154,24 @@ def restore(algorithm: Algorithm[State], data: Any, folder: Path) -> tuple[int, 
     return int(checkpoint.name), checkpoints.load(checkpoint, like)
 
 
-def compiled(algorithm: Algorithm[State], data: Any) -> Any:
+def compiled(algorithm: Algorithm[State], data: Any, state: State) -> Any:
     """`iterate` as a program for the devices of `algorithm.mesh`; the last one is kept.
 
-    data: arrays or shapes of them. To compile takes much memory, which may be there only before
-    the data are. Trainings that are alike, like those of gates, have one program.
+    Trainings that are alike, like those of gates, have one program.
     """
-    kinds = jax.eval_shape(lambda x: (x, algorithm.init(x, jax.random.key(0))), data)
-    leaves, kind = jax.tree.flatten(kinds)
+    leaves, kind = jax.tree.flatten((data, state))
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
     return _compiled(algorithm, algorithm.mesh, kind, shapes)
 
 
+@partial(
+    kept.jit,
+    static_argnames="algorithm",
+    compiler_options={"xla_backend_optimization_level": 0},
+)
 def begin(algorithm: Algorithm[State], data: Any, key: jax.Array) -> State:
     """The state before the first iteration."""
-    once = {"xla_backend_optimization_level": 0}
-    return xla.brief_jit(algorithm.init, compiler_options=once)(data, key)
+    return algorithm.init(data, key)
 
 
 def train(
@@ -197,7 +199,7 @@ def train(
     if done >= iterations:
         return state
 
-    iterate, mesh = compiled(algorithm, data), algorithm.mesh
+    iterate, mesh = compiled(algorithm, data, state), algorithm.mesh
     data = parallel.place(mesh, data)
     state = parallel.place(mesh, state, algorithm.specs)
     machine.release_memory()

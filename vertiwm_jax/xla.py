@@ -9,14 +9,11 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
 
 import jax
 import platformdirs
-
-T = TypeVar("T")
 
 _BRIEF = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 _READ_FLAGS = "from jaxlib import xla_client; xla_client.CompileOptions()"
@@ -25,11 +22,12 @@ _KEPT = 1 << 30  # bytes
 GONE = {"compile_cache": "is now JAX_COMPILATION_CACHE_DIR in the environment"}
 """A setting that configurations had, and what is in its place."""
 _left_out: set[str] = set()
+_keeps = False
 
 
 def left_out() -> list[str]:
     """Options that this package asks for and that the installed XLA does not know."""
-    _brief_options()
+    brief_options()
     return sorted(_left_out)
 
 
@@ -46,24 +44,9 @@ def add_flags(flags: Mapping[str, int | str]) -> None:
     os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
 
 
-def brief_jit(function: Callable[..., T], **options: Any) -> Callable[..., T]:
-    """`jax.jit` for a program that runs only briefly: it compiles in about half the time.
-
-    Loops that use vector units run many times slower in it.
-
-    options: those of `jax.jit`; `compiler_options` are added to those that shorten compilation.
-    """
-    extra = options.pop("compiler_options", {})
-
-    @functools.cache  # To ask for options starts JAX, which is too early where this is imported.
-    def compiled() -> Callable[..., T]:
-        return jax.jit(function, compiler_options=_brief_options() | extra, **options)
-
-    @functools.wraps(function)
-    def call(*args: Any, **kwargs: Any) -> T:
-        return compiled()(*args, **kwargs)
-
-    return call
+def keeps_compiled() -> bool:
+    """Whether `keep_compiled` was called."""
+    return _keeps
 
 
 def keep_compiled() -> None:
@@ -72,6 +55,8 @@ def keep_compiled() -> None:
     They lie where JAX was told (`JAX_COMPILATION_CACHE_DIR`), or in the user's folder of caches, in
     one for this kind of CPU. `JAX_ENABLE_COMPILATION_CACHE=false` turns it off.
     """
+    global _keeps
+    _keeps = True
     if not jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
         kept = platformdirs.user_cache_path("vertiwm_jax") / f"programs-{cpu()}"
         jax.config.update("jax_compilation_cache_dir", str(kept))
@@ -100,7 +85,11 @@ def _accepts(flags: Iterable[str]) -> bool:
 
 
 @functools.cache
-def _brief_options() -> dict[str, int]:
+def brief_options() -> dict[str, int]:
+    """Compiler options for programs that run only briefly: they compile in half the time.
+
+    To ask for them starts JAX.
+    """
     return {name: value for name, value in _BRIEF.items() if _knows(name, value)}
 
 

@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import gymnax
 import jax
 import numpy as np
@@ -65,3 +68,20 @@ def test_settings_decide_worlds_and_tasks(made):
 def test_a_model_that_does_not_exist_is_refused():
     with pytest.raises(CheckpointError, match="expected unicycle, found"):
         gymnax.make(GYMNAX_NAME, model="unicycle")
+
+
+IMPORT = """
+import sys
+import vertiwm_jax.rl.experiment
+drawing = {"seaborn", "pandas", "matplotlib.pyplot"}
+assert not drawing & set(sys.modules), drawing & set(sys.modules)
+from gymnax.environments.misc import pong
+assert len(pong.sns.color_palette()) and pong.plt.figure is sys.modules["matplotlib.pyplot"].figure
+assert drawing <= set(sys.modules)
+import seaborn
+assert seaborn.__spec__ is not None
+"""
+
+
+def test_what_gymnax_draws_with_is_imported_when_it_draws():
+    subprocess.run([sys.executable, "-c", IMPORT], check=True)

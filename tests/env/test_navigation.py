@@ -17,6 +17,7 @@ from vertiwm_jax.env.suites import circle_tasks
 from vertiwm_jax.env.task import NavigationConfig
 from vertiwm_jax.env.termination import TerminationReason
 from vertiwm_jax.mechanics.kinematic import KinematicBicycle
+from vertiwm_jax.mechanics.simulator import Simulator
 from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models.registry import ModelName
 from vertiwm_jax.rl import experiment as task_of_learning
@@ -211,13 +212,19 @@ def test_starts_stand_on_the_ground_and_resets_draw_all_of_them():
     assert len(np.unique(observation, axis=0)) == 8
 
 
-def test_shapes_are_those_of_what_is_made():
+@pytest.mark.integration
+def test_a_start_is_what_the_model_begins_with():
+    """Whose history the pool keeps without its empty caches."""
+    model, params = task_of_learning.dynamics(TaskConfig(compute_dtype="float32"), "vertiwm")
     terrain = ground(hills())
     pool = circle_tasks(terrain, 55.0, 3)
-    env, made = bicycle_env(terrain, pool)
-    shapes = env.make_params(BICYCLE, terrain, pool, settled=False)
-    chex.assert_trees_all_equal_shapes_and_dtypes(shapes, made)
-    assert isinstance(shapes.start_observation, jax.ShapeDtypeStruct)
+    env = NavigationEnv(model, settling=Simulator())
+    made = env.make_params(params, terrain, pool)
+    _, start = env.start(made, 1)
+    begun = jax.jit(model.init)(params, terrain, start.vehicle)
+    chex.assert_trees_all_close(start.history, begun, atol=1e-5)
+    chex.assert_trees_all_equal_shapes_and_dtypes(start.history, begun)
+    assert sum(x.nbytes for x in jax.tree.leaves(made.starts)) < 3 * 20_000
 
 
 def test_step_compiles_once_and_resets_by_itself():
@@ -248,15 +255,16 @@ def test_a_model_is_traced_once_for_starts_and_for_steps(name, monkeypatch):
         return step(self, *args)
 
     monkeypatch.setattr(type(model), "step", noted)
+    jax.clear_caches()
     terrain = ground(hills())
     pool = circle_tasks(terrain, 55.0, 4)
     env, number = NavigationEnv(model), len(pool.world)
-    shapes = env.make_params(params, terrain, pool, settled=False)
+    made = env.make_params(params, terrain, pool)
     mesh = parallel.mesh(number)
     keys, actions = jax.random.split(KEY, number), jnp.zeros((number, 2))
     given = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=parallel.shardings(mesh)),
-        (keys, shapes.starts, actions, shapes),
+        (keys, made.starts, actions, made),
     )
     with jax.set_mesh(mesh):
         jax.eval_shape(parallel.vmap(env.step, (0, 0, 0, None)), *given)

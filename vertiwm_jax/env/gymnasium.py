@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from gymnax.environments.spaces import gymnax_space_to_gym_space
 
 from vertiwm_jax import machine
+from vertiwm_jax.env._gymnax import gymnax_space_to_gym_space
 from vertiwm_jax.env.navigation import NavigationEnv
 from vertiwm_jax.env.task import TaskParams, TaskState
 from vertiwm_jax.env.termination import TerminationReason

@@ -1,16 +1,16 @@
 """Goal navigation over any vehicle model, as a gymnax environment."""
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnax.environments import environment, spaces
 
-from vertiwm_jax import machine, parallel, xla
+from vertiwm_jax import kept, machine, parallel
 from vertiwm_jax.dynamics import (
     Dynamics,
     History,
@@ -22,6 +22,7 @@ from vertiwm_jax.dynamics import (
     step,
 )
 from vertiwm_jax.env import observation, route, suites
+from vertiwm_jax.env._gymnax import Box, Environment
 from vertiwm_jax.env.agent import Policy, corrected
 from vertiwm_jax.env.randomization import DomainRandomization, RandomizationConfig
 from vertiwm_jax.env.reward import reward
@@ -32,6 +33,7 @@ from vertiwm_jax.mechanics.kinematic import place
 from vertiwm_jax.mechanics.simulator import Simulator, chrono_like
 from vertiwm_jax.mechanics.vehicle import HMMWV, Vehicle, load_vehicle
 from vertiwm_jax.models.registry import Imagined, load_encoders, load_model
+from vertiwm_jax.networks.transformer import KeyValueCache
 from vertiwm_jax.perception.features import Encoders
 from vertiwm_jax.perception.perceive import embed
 from vertiwm_jax.precision import float32
@@ -40,11 +42,12 @@ from vertiwm_jax.terrain import obstacles, patches, query, sensing
 from vertiwm_jax.terrain.files import load_map
 from vertiwm_jax.terrain.map import TerrainMap, expect_room
 
+T = TypeVar("T")
 _Placed = tuple[VehicleState, History]
 
 
 @dataclasses.dataclass(frozen=True)
-class NavigationEnv(environment.Environment[TaskState, TaskParams]):
+class NavigationEnv(Environment[TaskState, TaskParams]):
     """Drives to a goal with actions in [-1, 1]^2, speed and steering, at 10 Hz.
 
     Two environments of equal fields are equal and share compiled code. There are no default
@@ -74,8 +77,6 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         tasks: Tasks,
         vehicle: Vehicle | None = None,
         encoders: Encoders | None = None,
-        *,
-        settled: bool = True,
     ) -> TaskParams:
         """Parameters whose pool of starts is `tasks`, each settled on the ground.
 
@@ -85,8 +86,6 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
             tasks: on these worlds.
             vehicle: what the model moves; an HMMWV by default.
             encoders: by which policies see the ground, where the model does not keep what it sees.
-            settled: if false, nothing is settled, and the starts are shapes alone. That is enough
-                to restore what was learned with such parameters, or to compile a training.
 
         Raises:
             ValueError: names the first task that cannot be driven, or whose settled state is not
@@ -97,7 +96,7 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         patches.footprint_covered(reach, max(map(abs, config.speed_range)))
         sensing.check(config.sensing, terrain)
         validate(tasks, terrain, config.goal_radius, config.map_margin)
-        if config.straight or not settled:
+        if config.straight:
             routes = route.straight(config.route, terrain, tasks.goal)
         else:
             routes = route.plan(config.route, terrain, vehicle, tasks.world, tasks.goal)
@@ -114,33 +113,24 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         # Not all at once: patches of thousands of vehicles fill gigabytes.
         of_device = machine.together(cpu=64, accelerator=1024)
         together = min(of_device * jax.device_count(), pool)
+        settle = parallel.shared_out(partial(_settle, self), together)
         numbered = tasks, jnp.arange(pool)
-        if settled:
-            settle = parallel.shared_out(partial(_settle_once, self), together)
-            starts, seen = parallel.in_turns(lambda x: settle(params, *x), numbered, together)
-            states = np.asarray(starts.vehicle.vector)
-            finite = np.isfinite(states).all(axis=-1)
-            if not finite.all():
-                i = int(np.argmin(finite))
-                raise TaskError(
-                    f"dynamics: expected a finite state after {config.settle_steps} steps of "
-                    f"standing still, found {states[i]}; {tasks.told(i, terrain)}; "
-                    f"{np.sum(~finite)} of {pool} tasks are so"
-                )
-        else:
-            # As they will settle, so that it is traced only once.
-            mesh, some = parallel.mesh(together), jax.tree.map(lambda x: x[:together], numbered)
-            with jax.set_mesh(mesh):
-                given = parallel.place(mesh, (params, *some))
-                shapes = jax.eval_shape(partial(_settle, self), *given)
-            starts, seen = jax.tree.map(
-                lambda x: jax.ShapeDtypeStruct((pool, *x.shape[1:]), x.dtype), shapes
+        starts, seen = parallel.in_turns(lambda x: settle(params, *x), numbered, together)
+        states = np.asarray(starts.vehicle.vector)
+        finite = np.isfinite(states).all(axis=-1)
+        if not finite.all():
+            i = int(np.argmin(finite))
+            raise TaskError(
+                f"dynamics: expected a finite state after {config.settle_steps} steps of "
+                f"standing still, found {states[i]}; {tasks.told(i, terrain)}; "
+                f"{np.sum(~finite)} of {pool} tasks are so"
             )
         return dataclasses.replace(params, starts=starts, start_observation=seen)
 
     def start(self, params: TaskParams, index: jax.Array) -> tuple[jax.Array, TaskState]:
         """Observation and state of start `[]` of the pool."""
-        return jax.tree.map(lambda x: x[index], (params.start_observation, params.starts))
+        seen, state = jax.tree.map(lambda x: x[index], (params.start_observation, params.starts))
+        return seen, _of_caches(state, _emptied) if self.settling else state
 
     @float32
     def reset_env(self, key: jax.Array, params: TaskParams) -> tuple[jax.Array, TaskState]:
@@ -306,17 +296,17 @@ class NavigationEnv(environment.Environment[TaskState, TaskParams]):
         """Whether only the time is over: the value of the state that follows still counts."""
         return state.ending == TerminationReason.TIMED_OUT
 
-    def action_space(self, params: TaskParams | None = None) -> spaces.Box:
+    def action_space(self, params: TaskParams | None = None) -> Box:
         """[-1, 1]^2."""
-        return spaces.Box(-1.0, 1.0, (2,), jnp.float32)
+        return Box(-1.0, 1.0, (2,), jnp.float32)
 
-    def observation_space(self, params: TaskParams | None = None) -> spaces.Box:
+    def observation_space(self, params: TaskParams | None = None) -> Box:
         """Every entry within the observation's limit."""
         limit, size = observation.OBSERVATION_LIMIT, self.config.observed.size
-        return spaces.Box(-limit, limit, (size,), jnp.float32)
+        return Box(-limit, limit, (size,), jnp.float32)
 
 
-@partial(jax.jit, static_argnames="env")
+@partial(kept.jit, static_argnames="env")
 def _settle(
     env: NavigationEnv, params: TaskParams, tasks: Tasks, numbers: jax.Array
 ) -> tuple[TaskState, jax.Array]:
@@ -371,7 +361,8 @@ def _settle(
             variation=DomainRandomization.draw(env.variation, jax.random.key(0), action),
             observed=seen,
         )
-        return state, env.observe(None, state, None, params)
+        seen = env.observe(None, state, None, params)
+        return _of_caches(state, _left_out) if env.settling else state, seen
 
     # Steps of all, and not all steps of each: inside of `vmap`, a scan is traced again until it is
     # known what of a history differs between vehicles.
@@ -383,8 +374,23 @@ def _settle(
     return start(params, tasks, numbers, at_rest)
 
 
-# Apart, for what is traced inside of something else, as for its shapes, has no compiler options.
-_settle_once = xla.brief_jit(_settle, static_argnames="env")
+def _of_caches(tree: T, change: Callable[[jax.Array], jax.Array]) -> T:
+    """The tree with a change to all arrays of its caches of past tokens."""
+
+    def one(x: Any) -> Any:
+        return jax.tree.map(change, x) if isinstance(x, KeyValueCache) else x
+
+    return jax.tree.map(one, tree, is_leaf=lambda x: isinstance(x, KeyValueCache))
+
+
+def _left_out(x: jax.Array) -> jax.Array:
+    """Nothing of an empty cache but its shape: those of a pool would fill half a gigabyte."""
+    return jnp.zeros((0, *x.shape), x.dtype)
+
+
+def _emptied(x: jax.Array) -> jax.Array:
+    """The empty cache that was left out."""
+    return jnp.zeros(x.shape[1:], x.dtype)
 
 
 @float32

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax import machine, parallel
+from vertiwm_jax import kept, machine, parallel
 from vertiwm_jax.config import Bounds, NotNegative, settings
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.mechanics.vehicle import Vehicle
@@ -168,7 +168,7 @@ def straight(config: RouteConfig, terrain: TerrainMap, goal: jax.Array) -> Route
     return Routes(jnp.linalg.norm(offset, axis=-1), jnp.int32(0))
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@functools.partial(kept.jit, static_argnames="config", brief=False)
 def _plan(
     config: RouteConfig, vehicle: Vehicle, terrain: TerrainMap, world: jax.Array, goal: jax.Array
 ) -> jax.Array:

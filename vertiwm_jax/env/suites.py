@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vertiwm_jax import machine, xla
+from vertiwm_jax import kept, machine
 from vertiwm_jax.config import AtLeastOne, ConfigError, Count, CountOrZero, NotNegative, settings
 from vertiwm_jax.env.termination import edge_distance
 from vertiwm_jax.errors import UserError
@@ -179,7 +179,7 @@ def circle_tasks(
     return _across(terrain, half * np.array([1, -1]), radius, pairs, sway)
 
 
-@functools.partial(xla.brief_jit, static_argnames=("radius", "pairs", "sway"))
+@functools.partial(kept.jit, static_argnames=("radius", "pairs", "sway"))
 def _across(terrain: TerrainMap, half: jax.Array, radius: float, pairs: int, sway: float) -> Tasks:
     """Tasks across circles about the places that lie `half` m from the corners of all worlds."""
     middle = terrain.origin + half
@@ -233,7 +233,7 @@ def random_tasks(key: jax.Array, terrain: TerrainMap, count: int, vehicle: Vehic
     return tasks
 
 
-@functools.partial(xla.brief_jit, static_argnames="count")
+@functools.partial(kept.jit, static_argnames="count")
 def _draw(
     key: jax.Array, terrain: TerrainMap, count: int, vehicle: Vehicle
 ) -> tuple[Tasks, jax.Array]:

@@ -5,11 +5,11 @@ import dataclasses
 import jax
 import numpy as np
 from flax import struct
-from gymnax.environments import environment
 
 from vertiwm_jax.config import CountOrZero, settings
 from vertiwm_jax.dynamics import History, Params
 from vertiwm_jax.env import route
+from vertiwm_jax.env._gymnax import EnvParams, EnvState
 from vertiwm_jax.env.observation import ObservationSpec
 from vertiwm_jax.env.randomization import DomainRandomization
 from vertiwm_jax.env.reward import RewardConfig
@@ -86,7 +86,7 @@ class NavigationConfig:
 
 
 @struct.dataclass(kw_only=True)
-class TaskState(environment.EnvState):
+class TaskState(EnvState):
     """One episode under way.
 
     vehicle, history: the model's.
@@ -113,12 +113,13 @@ class TaskState(environment.EnvState):
 
 
 @struct.dataclass(kw_only=True)
-class TaskParams(environment.EnvParams):
+class TaskParams(EnvParams):
     """What an environment is run with: arrays, so that nothing here is compiled in.
 
     dynamics: the model's parameters. vehicle: what drives; its model should know the same.
     terrain: all worlds; routes: to all goals of the pool.
-    starts, start_observation: leaves `[P, ...]` and `[P, O]`, the pool that resets draw from.
+    starts, start_observation: leaves `[P, ...]` and `[P, O]`, the pool that resets draw from, by
+        `NavigationEnv.start`.
     max_steps_in_episode: `[]` int32.
     encoders: by which policies see the ground, where the model's histories do not have that.
     """

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from gymnax.environments.environment import Environment
 
 from vertiwm_jax import parallel
 from vertiwm_jax.config import Count, Positive, Share, settings
+from vertiwm_jax.env._gymnax import Environment
 from vertiwm_jax.networks.policy import Actor, Critic, ObservationLayout, TanhNormalActor
 from vertiwm_jax.rl.policy import DeterministicPolicy, Value
 from vertiwm_jax.rl.running_statistics import RunningStatistics

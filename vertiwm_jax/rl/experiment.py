@@ -327,17 +327,12 @@ def run(
     terrain, pool, held_out = training_ground(config, worlds)
     machine.forget_programs()
     env = env_of(config, config.model, moves, config.variation)
-    given = weights, terrain, pool, config.driven.vehicle, encoders(config)
-    shapes = env.make_params(*given, settled=False)
     algorithm = config.algorithm(env)
     seeds = Seeds(algorithm, config.loop.seeds)
-    restored = training.restore(seeds, shapes, config.resume) if config.resume else None
-    if not restored or restored[0] < algorithm.iterations:
-        # Now, while there are no vehicles yet that fill the memory.
-        training.compiled(seeds, shapes)
     _log.info("placing vehicles for %s tasks ...", f"{len(pool.world):,}")
-    params = env.make_params(*given)
+    params = env.make_params(weights, terrain, pool, config.driven.vehicle, encoders(config))
     machine.forget_programs()
+    restored = training.restore(seeds, params, config.resume) if config.resume else None
     with Run.begin(config, config.name, restored[0] if restored else 0, config.wandb) as begun:
         _log.info("run folder %s", begun.folder)
         products = "" if config.model == "builtin" else f", multiplying {config.compute_dtype}"

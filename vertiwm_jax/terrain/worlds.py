@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertiwm_jax import froude, xla
+from vertiwm_jax import froude, kept
 from vertiwm_jax.config import AtLeastOne, Bounds, CountOrZero, Share, settings
 from vertiwm_jax.precision import float32
 from vertiwm_jax.terrain.classes import FIRST_DEFORMABLE, STANDARD
@@ -124,7 +124,7 @@ def make_worlds(
     return generate(jax.random.split(jax.random.key(seed), number), config, scale)
 
 
-@xla.brief_jit
+@kept.jit
 def _ground(
     key: jax.Array, slope_deg: jax.Array, kind: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -249,7 +249,7 @@ def _friction(key: jax.Array, semantic: jax.Array) -> jax.Array:
     return jnp.where(semantic < FIRST_DEFORMABLE, jnp.clip(drawn, *_FRICTION_LIMITS), 0.0)
 
 
-@functools.partial(xla.brief_jit, static_argnames=("rocks", "trees"))
+@functools.partial(kept.jit, static_argnames=("rocks", "trees"))
 def _obstacles(key: jax.Array, rocks: int, trees: int, obstructed: float) -> jax.Array:
     """`[rocks + trees, 5]` boxes anywhere on the map but near the circle of starts and goals.
 
