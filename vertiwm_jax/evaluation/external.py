@@ -71,8 +71,8 @@ def _drive(
     """Drives one task. Arrays come from and go to host memory, as they pass between processes."""
     tasks, params, agent, keys = shared
     asked = jax.tree.map(lambda x: x[number], tasks)
-    params, agent = jax.device_put((params, agent))
     _, start = env.start(params, jnp.int32(number))
+    params, agent, start = jax.device_put((params, agent, start))
     key = jax.random.wrap_key_data(jnp.asarray(keys[number]))
     pilot = AgentPilot(env, params, agent, start, key)
     pose, length = (*asked.start.tolist(), float(asked.yaw)), int(params.max_steps_in_episode)
