@@ -76,6 +76,9 @@ def jit(
 ) -> Callable[..., T]:
     """`jax.jit` for a program of the start of a training, which later processes need not trace.
 
+    Only if `xla.keep_compiled` was called: what was changed in this process, as tests do, would
+    not be seen.
+
     brief: whether it runs only briefly, and is therefore compiled in about half the time; loops
         that use vector units run many times slower in it. compiler_options: are added.
     """
