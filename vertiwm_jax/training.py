@@ -159,7 +159,8 @@ def compiled(algorithm: Algorithm[State], data: Any, state: State) -> Any:
 
     Trainings that are alike, like those of gates, have one program.
     """
-    leaves, kind = jax.tree.flatten((data, state))
+    # Shapes also of Python's numbers, which parameters of gymnax's environments have.
+    leaves, kind = jax.tree.flatten(jax.eval_shape(lambda *given: given, data, state))
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
     return _compiled(algorithm, algorithm.mesh, kind, shapes)
 
