@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import Mesh
 
 from vertiwm_jax import kept, machine, runs, xla
@@ -75,11 +76,18 @@ def test_what_cannot_be_recognized_is_not_told(x):
 
 @pytest.fixture
 def folder(tmp_path):
-    """In which programs are kept."""
-    before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    """In which programs are kept, beside those of JAX's cache."""
+    names = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
+    before = [getattr(jax.config, name) for name in names]
+
+    def use(values):
+        for name, value in zip(names, values, strict=True):
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()
+
+    use([str(tmp_path), 0])
     yield tmp_path / "ready"
-    jax.config.update("jax_compilation_cache_dir", before)
+    use(before)
 
 
 def doubled(decided_by):
@@ -111,6 +119,13 @@ def test_a_damaged_program_is_compiled_anew(folder):
     for damaged in (b"", whole[: len(whole) // 2], b"something else"):
         file.write_bytes(damaged)
         assert doubled(ENV) and not doubled(ENV)
+
+
+def test_a_program_that_the_cache_of_jax_has_is_kept_whole(folder):
+    """What JAX reads from there would be written without its functions, and fail when called."""
+    assert doubled(object())  # By JAX's cache alone.
+    jax.clear_caches()
+    assert doubled(ENV) and not doubled(ENV)
 
 
 def test_what_cannot_be_kept_is_compiled(folder, monkeypatch):

@@ -14,7 +14,7 @@ import os
 import pickle
 import platform
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import serialize_executable
+from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import Mesh
 
 from vertiwm_jax import atomic, xla
@@ -61,7 +62,8 @@ def program(
         return compiles()
     with contextlib.suppress(Exception):
         return _load(file, mesh)
-    made = compiles()
+    with _apart_from_cache():
+        made = compiles()
     with contextlib.suppress(Exception):
         _keep(file, made)
     return made
@@ -195,6 +197,18 @@ def _source() -> tuple[str, ...]:
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest(), *versions
+
+
+@contextlib.contextmanager
+def _apart_from_cache() -> Iterator[None]:
+    """Nothing is read from JAX's cache: what comes from there lacks functions if it is kept."""
+    jax.config.update("jax_enable_compilation_cache", False)
+    compilation_cache.reset_cache()
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_compilation_cache", True)
+        compilation_cache.reset_cache()
 
 
 @functools.cache
