@@ -15,6 +15,7 @@ from vertiwm_jax import atomic
 
 _APART = {
     "bogged",
+    "devices",
     "gpu",
     "identification",
     "measured_wheels",
