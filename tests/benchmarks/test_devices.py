@@ -1,5 +1,6 @@
 """`python -m benchmarks.devices` compares trainings with that of one device."""
 
+import itertools
 import json
 import subprocess
 import sys
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from benchmarks import devices
 
 LEARNED = {("1", "0.001"): 1.0, ("2", "0.001"): 1.25, ("1", "0.0010000001192092897"): 1.5}
@@ -21,13 +23,13 @@ def started(monkeypatch):
     class Training:
         def __init__(self, command, env, **_):
             environments.append(env)
-            options = dict(zip(command, command[1:], strict=False))
+            options = dict(itertools.pairwise(command))
             found = LEARNED[env["JAX_NUM_CPU_DEVICES"], options.get("--ppo.learning-rate", "0.001")]
             if env.get("JAX_PROCESS_ID", "0") == "0":
                 run = Path(options["--runs"]) / "ppo-1"
                 (run / "policy").mkdir(parents=True)
                 numbers = {"step": 1, "reward": found, "timesteps_per_second": 10.0}
-                (run / "metrics.jsonl").write_text(json.dumps(numbers))
+                (run / "metrics.jsonl").write_text(json.dumps(numbers) + "\n")
                 weights = {"actor.bias": np.full(2, found), "observation_count": np.float32(1e6)}
                 np.savez(run / "policy" / "weights.npz", **weights)
 
