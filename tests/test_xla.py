@@ -46,9 +46,16 @@ def test_an_unknown_flag_ends_a_process_and_so_has_to_be_tried():
 
 def test_compiler_options_that_xla_does_not_know_are_left_out(monkeypatch):
     monkeypatch.setattr(xla, "_BRIEF", {KNOWN: 1, UNKNOWN: 1})
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
     assert xla.brief_options() == {KNOWN: 1} and xla._left_out == {UNKNOWN}
     with pytest.raises(jax.errors.JaxRuntimeError, match=UNKNOWN):
         jax.jit(lambda x: 2 * x, compiler_options={UNKNOWN: 1})(jnp.float32(1))
+
+
+def test_compiler_options_that_flags_set_are_left_as_they_are(monkeypatch):
+    monkeypatch.setattr(xla, "_BRIEF", {KNOWN: 1})
+    monkeypatch.setenv("XLA_FLAGS", f"--{KNOWN}=0")
+    assert xla.brief_options() == {}
 
 
 TWICE = """

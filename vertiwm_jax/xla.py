@@ -88,9 +88,11 @@ def _accepts(flags: Iterable[str]) -> bool:
 def brief_options() -> dict[str, int]:
     """Compiler options for programs that run only briefly: they compile in half the time.
 
-    To ask for them starts JAX.
+    What `XLA_FLAGS` sets stays as it is. To ask for them starts JAX.
     """
-    return {name: value for name, value in _BRIEF.items() if _knows(name, value)}
+    given = os.environ.get("XLA_FLAGS", "")
+    options = {name: value for name, value in _BRIEF.items() if name not in given}
+    return {name: value for name, value in options.items() if _knows(name, value)}
 
 
 def _knows(name: str, value: int) -> bool:
