@@ -1,8 +1,9 @@
-"""Bounds on the error of a prediction, from how much the parts of the model disagree.
+"""Bounds on the error of a prediction, from signs of it that the model itself shows.
 
 Where models that fail for different reasons disagree, at least one of them is wrong
-(Lakshminarayanan et al., 2017, of ensembles): the two specialists, or several gates. How far off a
-prediction then is has to be measured on recorded drives. The scale and the quantiles of errors come
+(Lakshminarayanan et al., 2017, of ensembles): the two specialists, or several gates. Where the
+predicted way is not as long as commanded, the vehicle slips or climbs, which is hard to predict.
+How far off a prediction then is has to be measured on recorded drives. Weights and quantiles come
 from some drives and are tested on others, as in split conformal prediction with normalized scores
 (Lei et al., 2018), each world or vehicle in turn (Barber et al., 2021, "jackknife+", of folds).
 """
@@ -38,13 +39,13 @@ _log = logging.getLogger(__name__)
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 """Shares of predictions that a bound is to hold for."""
 PARTS = 5
-"""Equal parts of the windows, by disagreement, that are looked at apart."""
-_LEAST = 1e-3  # m, of a scale
+"""Equal parts of the windows, by expected error, that are looked at apart."""
+_LEAST = 1e-3  # m, of an expected error
 
 
 @settings
 class CalibrationTest:
-    """How far off predictions of Verti-WM are, by how much its gates or specialists disagree.
+    """How far off predictions of Verti-WM are, by what it shows of its certainty.
 
     Bounds on the error are tried on drives of other worlds, or vehicles, than they are found from.
     """
@@ -111,16 +112,17 @@ class CalibrationTest:
 
 @dataclass(frozen=True)
 class Signs:
-    """Errors of N windows, and what the model said of its certainty.
+    """Errors of N windows, and what the model showed of its certainty.
 
     error: `[N]` m, of the position after the last step.
-    disagreement: `[N]` m by name, the most telling first: how much the "gates" disagree, if there
-        are several, and the "specialists", summed over the predicted steps; and zeros as "nothing".
+    shown: `[N, signs]` m by name, the most telling first. Signs are by how much the predicted way
+        is longer or shorter than commanded ("lag"), and how much the "specialists" disagree, and
+        the "gates" if there are several, summed over the predicted steps. "nothing" is no sign.
     drive, world: `[N]` of which the windows are; vehicle: `[N]` what drove there is called.
     """
 
     error: np.ndarray
-    disagreement: Mapping[str, np.ndarray]
+    shown: Mapping[str, np.ndarray]
     drive: np.ndarray
     world: np.ndarray
     vehicle: np.ndarray
@@ -135,16 +137,21 @@ class Signs:
             raise DataError(
                 f"expected finite predictions, found {lost} of {len(error)} that are not"
             )
-        gates = {"gates": read.spread.sum(axis=1)} if np.any(read.spread) else {}
-        told = {**gates, "specialists": read.disagreement.sum(axis=1)}
-        told["nothing"] = np.zeros_like(error)
-        return cls(error, told, test.drive, np.asarray(windows.world), test.vehicle)
+        gates, specialists = read.spread.sum(axis=1), read.disagreement.sum(axis=1)
+        first = np.asarray(windows.state[:, windows.context, None, :3])
+        legs = np.diff(np.concatenate([first, states.position], axis=1), axis=1)
+        speed = np.abs(np.asarray(windows.control[:, windows.context :, 0]))
+        lag = np.abs(STEP_SECONDS * speed.sum(axis=1) - np.linalg.norm(legs, axis=-1).sum(axis=1))
+        signs = {"gates and lag": (gates, lag), "gates": (gates,)} if np.any(gates) else {}
+        signs |= {"lag": (lag,), "specialists": (specialists,), "nothing": ()}
+        shown = {name: np.reshape(each, (-1, len(error))).T for name, each in signs.items()}
+        return cls(error, shown, test.drive, np.asarray(windows.world), test.vehicle)
 
     def rows(self, chosen: np.ndarray) -> Signs:
         """Of some of the windows, `[N]` bool."""
-        told = {name: each[chosen] for name, each in self.disagreement.items()}
+        shown = {name: each[chosen] for name, each in self.shown.items()}
         own = (each[chosen] for each in (self.drive, self.world, self.vehicle))
-        return Signs(self.error[chosen], told, *own)
+        return Signs(self.error[chosen], shown, *own)
 
     def folds(self, by: Literal["worlds", "vehicles"]) -> list[Fold]:
         """The windows of each world or vehicle to try bounds on, with all others to find them.
@@ -164,54 +171,58 @@ Fold = tuple[Signs, Signs]
 
 @dataclass(frozen=True)
 class Calibration:
-    """A bound on an error e for each level: quantile(level) of e / scale, times the scale.
+    """A bound on an error e for each level: quantile(level) of e / expected, times the expected.
 
-    line: the scale, m, over the disagreement in a prediction, m, as of `np.polyfit`.
-    scores: ratios of errors to their scales, of the drives that it was measured on.
+    weights: `[1 + signs]` of the expected error, which is linear in the signs; the constant first.
+    scores: ratios of errors to expected ones, of the drives that it was measured on.
     """
 
-    line: np.ndarray
+    weights: np.ndarray
     scores: np.ndarray
 
     @classmethod
-    def measure(cls, error: np.ndarray, disagreement: np.ndarray) -> Self:
-        """From errors and disagreements `[N]`, m; one bound for all if these are equal."""
-        line = np.polyfit(disagreement, error, int(np.ptp(disagreement) > 0))
-        scale = cls(line, np.empty(0)).scale(disagreement)
-        return cls(line, error / scale)
+    def measure(cls, error: np.ndarray, signs: np.ndarray) -> Self:
+        """By least squares, from errors `[N]` and their signs `[N, signs]`, m."""
+        weights = np.linalg.lstsq(_with_constant(signs), error)[0]
+        return cls(weights, error / cls(weights, np.empty(0)).expected(signs))
 
-    def scale(self, disagreement: np.ndarray) -> np.ndarray:
-        """`[N]` m, the scale of errors at disagreements `[N]`, m."""
-        return np.maximum(np.polyval(self.line, disagreement), _LEAST)
+    def expected(self, signs: np.ndarray) -> np.ndarray:
+        """`[N]` m, the expected error where the signs `[N, signs]`, m, are such."""
+        return np.maximum(_with_constant(signs) @ self.weights, _LEAST)
 
-    def bound(self, disagreement: np.ndarray, level: float) -> np.ndarray:
-        """`[N]` m, what a share `level` of errors is below at disagreements `[N]`, m."""
-        return np.quantile(self.scores, level) * self.scale(disagreement)
+    def quantile(self, level: float) -> float:
+        """What a share `level` of the ratios of errors to expected ones is below."""
+        return float(np.quantile(self.scores, level))
+
+    def bound(self, signs: np.ndarray, level: float) -> np.ndarray:
+        """`[N]` m, what a share `level` of errors is below where signs `[N, signs]` are such."""
+        return self.quantile(level) * self.expected(signs)
 
 
-def parts(error: np.ndarray, disagreement: np.ndarray) -> list[Row]:
-    """A row of errors `[N]`, m, for each equal part of the windows, by disagreement `[N]`, m."""
+def parts(error: np.ndarray, expected: np.ndarray) -> list[Row]:
+    """A row of errors `[N]`, m, for each equal part of the windows, by expected error `[N]`, m."""
     return [
         {
             "part of the windows": f"{i} of {PARTS}",
-            "disagreement, mm": f"{1000 * disagreement[part].mean():.3f}",
+            "expected error, m": f"{expected[part].mean():.3f}",
             "mean error, m": f"{error[part].mean():.3f}",
             "95 % of errors below, m": f"{np.quantile(error[part], 0.95):.3f}",
         }
-        for i, part in enumerate(_parts(disagreement), 1)
+        for i, part in enumerate(_parts(expected), 1)
     ]
 
 
 def coverage(folds: Sequence[Fold]) -> list[Row]:
-    """A row for each level and each kind of disagreement: how often bounds from it hold.
+    """A row for each level and each choice of signs: how often bounds from them hold.
 
-    The parts of the windows are by the first kind; intervals are over drives.
+    The parts of the windows are by the error expected from the first choice; intervals are over
+    drives.
     """
-    error, first = _tried(folds)
     drive = np.concatenate([tried.drive for _, tried in folds])
-    by_part, rows = _parts(first), []
+    error, expected = _tried(folds)
+    by_part, rows = _parts(expected), []
     for level in LEVELS:
-        for name in folds[0][0].disagreement:
+        for name in folds[0][0].shown:
             bound = _bounds(folds, name, level)
             held = error <= bound
             share = bootstrap(held, drive)
@@ -229,49 +240,48 @@ def coverage(folds: Sequence[Fold]) -> list[Row]:
 
 
 def _bounds(folds: Sequence[Fold], name: str, level: float) -> np.ndarray:
-    """`[N]` m, for all windows that bounds are tried on, from one kind of disagreement."""
+    """`[N]` m, for all windows that bounds are tried on, from one choice of signs."""
     every = zip(_measured(folds, name), folds, strict=True)
-    bounds = [found.bound(tried.disagreement[name], level) for found, (_, tried) in every]
+    bounds = [found.bound(tried.shown[name], level) for found, (_, tried) in every]
     return np.concatenate(bounds)
 
 
 def _measured(folds: Sequence[Fold], name: str) -> list[Calibration]:
-    return [Calibration.measure(known.error, known.disagreement[name]) for known, _ in folds]
+    return [Calibration.measure(known.error, known.shown[name]) for known, _ in folds]
 
 
 def _tried(folds: Sequence[Fold]) -> tuple[np.ndarray, np.ndarray]:
-    """Errors and disagreements `[N]`, m, of all windows that bounds are tried on."""
-    best = next(iter(folds[0][0].disagreement))
-    every = [(tried.error, tried.disagreement[best]) for _, tried in folds]
-    error, disagreement = map(np.concatenate, zip(*every, strict=True))
-    return error, disagreement
+    """Errors `[N]`, m, of all windows that bounds are tried on, and those to be expected."""
+    best = next(iter(folds[0][0].shown))
+    every = zip(_measured(folds, best), folds, strict=True)
+    expected = [found.expected(tried.shown[best]) for found, (_, tried) in every]
+    return np.concatenate([tried.error for _, tried in folds]), np.concatenate(expected)
 
 
 def picture(folds: Sequence[Fold]) -> Figure:
-    """Errors over disagreement with their bounds, and how often bounds of any level hold.
+    """Errors over those expected with their bounds, and how often bounds of any level hold.
 
-    The second panel is of the windows with least and with most disagreement, for bounds that know
-    the disagreement and for those that do not. On the diagonal, a bound holds as often as it says.
+    The second panel is of the windows with the least and the largest expected error, for bounds
+    from the signs and for one constant bound. On the diagonal, a bound holds as often as it says.
     """
-    (error, disagreement), best = _tried(folds), next(iter(folds[0][0].disagreement))
-    by_part, ordered = _parts(disagreement), np.sort(disagreement)
+    (error, expected), best = _tried(folds), next(iter(folds[0][0].shown))
+    by_part, ends = _parts(expected), np.array([expected.min(), expected.max()])
     levels = np.linspace(0.02, 0.98, 49)
     with style():
         figure = sheet(7.2, 3.5)
         left, right = figure.subplots(1, 2)
-        left.plot(disagreement, error, ".", color="0.6", markersize=2.5)
+        left.plot(expected, error, ".", color="0.6", markersize=2.5)
         for i, level in enumerate(LEVELS):
             color, dash = line(i)
-            bounds = [found.bound(ordered, level) for found in _measured(folds, best)]
-            label = f"bound for {level:.0%}"
-            left.plot(ordered, np.mean(bounds, axis=0), dash, color=color, label=label)
-        left.set(xlabel="disagreement [m]", ylabel="position error [m]")
+            ratio = np.mean([found.quantile(level) for found in _measured(folds, best)])
+            left.plot(ends, ratio * ends, dash, color=color, label=f"bound for {level:.0%}")
+        left.set(xlabel="expected error [m]", ylabel="position error [m]")
         left.set(xscale="log", yscale="log", ylim=(np.quantile(error, 0.005), None))
-        for i, (name, told) in enumerate({best: "", "nothing": "not "}.items()):
+        for i, (name, kind) in enumerate({best: f"from {best}", "nothing": "constant"}.items()):
             held_by = [error <= _bounds(folds, name, level) for level in levels]
-            for end, part, dash in (("least", by_part[0], "-"), ("most", by_part[-1], "--")):
+            for size, part, dash in (("small", by_part[0], "-"), ("large", by_part[-1], "--")):
                 held = [np.mean(held[part]) for held in held_by]
-                label = f"{told}from disagreement, where it is {end}"
+                label = f"{kind}, {size} expected errors"
                 right.plot(levels, held, dash, color=line(i)[0], label=label)
         right.plot([0, 1], [0, 1], color="0.6", linewidth=0.8)
         right.set(xlabel="level of the bound", ylabel="share of errors below it")
@@ -280,6 +290,11 @@ def picture(folds: Sequence[Fold]) -> Figure:
     return figure
 
 
-def _parts(disagreement: np.ndarray) -> list[np.ndarray]:
-    """Rows of the equal parts of windows, from least disagreement to most."""
-    return np.array_split(np.argsort(disagreement, kind="stable"), PARTS)
+def _parts(expected: np.ndarray) -> list[np.ndarray]:
+    """Rows of the equal parts of windows, from the least expected error to the largest."""
+    return np.array_split(np.argsort(expected, kind="stable"), PARTS)
+
+
+def _with_constant(signs: np.ndarray) -> np.ndarray:
+    """`[N, 1 + signs]`, a column of ones before the signs."""
+    return np.concatenate([np.ones((len(signs), 1)), signs], axis=1)
