@@ -18,6 +18,7 @@ import numpy as np
 
 from benchmarks._harness import parser, report
 from vertiwm_jax.dynamics import rollout
+from vertiwm_jax.evaluation.prediction import bootstrap
 from vertiwm_jax.learning import schema
 from vertiwm_jax.learning.identification import MASS, PRIORS, Number, identify
 from vertiwm_jax.mechanics.kinematic import place
@@ -30,6 +31,8 @@ from vertiwm_jax.terrain.map import TerrainMap
 DRIVES, STEPS = 6, 100
 NOISE = np.repeat([0.005, 0.0015, 0.01, 0.01], 3)
 """Of recorded states: m, rad, m/s and rad/s."""
+TOLD = 0.1
+"""Share of its prior's width that drives take away from a number of which they tell something."""
 
 
 @jax.jit
@@ -83,7 +86,7 @@ def recovered(seed: int) -> tuple[Mapping[str, float], tuple[Number, ...], np.nd
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("--vehicles", type=int, default=10)
+    options.add_argument("--vehicles", type=int, default=20)
     args = options.parse_args()
     every = [recovered(seed) for seed in range(args.vehicles)]
     results = {}
@@ -97,10 +100,19 @@ def main() -> None:
             "half-width, of the prior's": float(np.median(width)),
             "off by": float(np.median(off)),
         }
-    columns = ("within the interval", "half-width, of the prior's")
-    results["all"] = {
-        columns[0]: float(np.mean([row[columns[0]] for row in results.values()])),
-        columns[1]: float(np.median([row[columns[1]] for row in results.values()])),
+    told = [
+        (vehicle, number.low <= true[number.name] <= number.high, 1 - number.told)
+        for vehicle, (true, numbers, *_) in enumerate(every)
+        for number in numbers
+        if number.told > TOLD
+    ]
+    vehicle, inside, width = map(np.array, zip(*told, strict=True))
+    share = bootstrap(inside, vehicle)
+    results["what is told"] = {
+        "within the interval": share.mean,
+        "at least": share.low,
+        "at most": share.high,
+        "half-width, of the prior's": float(np.median(width)),
         "error before, m": float(np.mean([error[0] for *_, error, _ in every])),
         "error after, m": float(np.mean([error[1] for *_, error, _ in every])),
         "seconds": float(np.median([seconds for *_, seconds in every])),

@@ -251,9 +251,9 @@ def _posterior(misses: Misses, blur: Misses, numbers: int) -> tuple[np.ndarray, 
             lambda away, weighted=weighted: np.append(weighted(away), away),
             found,
             all_slopes,  # pyright: ignore[reportArgumentType]
-            xtol=1e-3,
-            ftol=1e-4,
-            max_nfev=8,
+            xtol=1e-4,
+            ftol=1e-5,
+            max_nfev=30,
         ).x
     slope = slopes(found).reshape(-1, numbers)
     return found, np.linalg.inv(slope.T @ slope + prior)
