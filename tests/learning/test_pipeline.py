@@ -1,6 +1,7 @@
 """Whose physics is fitted; what is fitted, and in which order, is tested with the command."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import chex
 import pytest
@@ -8,6 +9,7 @@ from learning import recordings
 
 from vertiwm_jax.learning import calibration, pipeline, stages
 from vertiwm_jax.learning.pipeline import PipelineConfig
+from vertiwm_jax.learning.schema import DataError
 from vertiwm_jax.mechanics import vehicle
 from vertiwm_jax.mechanics.vehicle import load_vehicle
 from vertiwm_jax.models import files
@@ -59,6 +61,23 @@ def test_a_model_of_any_vehicle_learns_by_the_vehicles_of_the_drives(
         assert (found is None) == (expected is None)
         if found is not None:
             assert found.mass.tolist() == pytest.approx([expected])
+
+
+def test_drives_are_of_the_kind_that_their_folder_is_named_after(tmp_path, monkeypatch):
+    """Whether that folder is given or the one above; those elsewhere are of no kind."""
+    rigid, soft, other = (tmp_path / name for name in ("rigid", "deformable", "mine"))
+    for folder in (rigid, soft, other):
+        folder.mkdir()
+        (folder / "drives.npz").touch()
+    for given in ((tmp_path, other), (rigid, soft, other)):
+        config = PipelineConfig(data=given)
+        assert pipeline.folders(config, ["rigid"]) == [rigid, other]
+        assert set(pipeline.folders(config, pipeline.KINDS)) == {rigid, soft, other}
+    monkeypatch.chdir(rigid)
+    here = PipelineConfig(data=(Path(),))
+    assert pipeline.folders(here, ["rigid"]) == [Path()]
+    with pytest.raises(DataError, match="folders of them named mixed, found neither"):
+        pipeline.folders(here, ["mixed"])
 
 
 def test_a_vehicle_that_is_none_is_named():

@@ -80,7 +80,8 @@ class PipelineConfig:
     """What world model is fitted, to what drives, and how."""
 
     data: tuple[Path, ...] = (Path("data/open"),)
-    """Folders of drives, or of such folders named rigid, deformable and mixed."""
+    """Folders of drives, or of such folders named rigid, deformable and mixed. Drives in others are
+    of no kind: all that is fitted learns from them."""
     add: tuple[Path, ...] = ()
     """Folders of more drives beside those, such as a policy has driven (`collect --policy`)."""
     reuse: tuple[Path, ...] = ()
@@ -154,10 +155,12 @@ def expect_drives(config: PipelineConfig) -> list[Collection]:
 
 
 def folders(config: PipelineConfig, kinds: Sequence[Kind]) -> list[Path]:
-    """Those with drives of these kinds, and those that are not divided into kinds."""
+    """Those with drives of these kinds, and those of no kind."""
     chosen, given = list[Path](), config.data + config.add
     for folder in given:
-        chosen += [folder] if any(folder.glob("*.npz")) else []
+        named = folder.absolute().name
+        fits = named in kinds or named not in KINDS
+        chosen += [folder] if fits and any(folder.glob("*.npz")) else []
         chosen += [folder / kind for kind in kinds if (folder / kind).is_dir()]
     if not chosen:
         raise DataError(
@@ -344,7 +347,7 @@ class _Pipeline:
         return self.driven if of_any else None
 
     def load(self, kinds: Sequence[Kind], split: Split) -> tuple[Drives, TerrainMap]:
-        """Drives of these kinds in all folders, and of folders that are not divided into kinds."""
+        """Drives of these kinds in all folders, and those of no kind."""
         key = tuple(kinds), split
         if key not in self.loaded:
             drives, terrain = dataset.load_drives(
