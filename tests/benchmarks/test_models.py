@@ -1,6 +1,9 @@
+import pytest
+
 from benchmarks import models
 
 
+@pytest.mark.integration
 def test_batches_are_driven_by_as_many_devices_as_they_are_worth():
     found = models.rates("builtin", None, (1, 8))
     assert [figures["devices"] for figures in found.values()] == [1, 2]

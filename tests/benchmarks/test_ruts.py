@@ -38,12 +38,14 @@ def recorded():
     return drives, terrain, stack([VEHICLE])
 
 
+@pytest.mark.integration
 def test_what_comes_back_crosses_its_own_tracks(recorded):
     """From 3 s after they were made: not on the way there, but for most of the way back."""
     found = ruts.crossing(*recorded)[0]
     assert not found[:2].any() and found[4:].all()
 
 
+@pytest.mark.integration
 def test_who_remembers_ruts_predicts_a_drive_in_them(recorded):
     drives, terrain, driven = recorded
     given = tuple(map(jnp.asarray, (drives.state, drives.control, drives.world)))

@@ -60,6 +60,7 @@ def test_states_and_slip_of_windows_are_found_again(tmp_path, sensors):
     assert float(found.turn_gain) == pytest.approx(1 / 3, abs=0.02)
 
 
+@pytest.mark.integration
 def test_errors_are_told_by_model_with_intervals_over_steps(tmp_path, monkeypatch):
     written(tmp_path / "robot.npz")
     monkeypatch.setattr(skid_steered, "FITTED", 6)

@@ -28,6 +28,7 @@ def test_it_is_made_by_name():
     assert GYMNAX_NAME in gymnax.registered_envs
 
 
+@pytest.mark.integration
 def test_random_rollouts_in_gymnax_s_own_way(made):
     env, env_params = made
 

@@ -227,6 +227,7 @@ def test_a_start_is_what_the_model_begins_with():
     assert sum(x.nbytes for x in jax.tree.leaves(made.starts)) < 3 * 20_000
 
 
+@pytest.mark.integration
 def test_step_compiles_once_and_resets_by_itself():
     terrain = terrain_map.stack([ground(hills()), ground(hills(height=0.5))])
     config = NavigationConfig(horizon_seconds=0.5)
@@ -271,6 +272,7 @@ def test_a_model_is_traced_once_for_starts_and_for_steps(name, monkeypatch):
     assert len(traced) == 1
 
 
+@pytest.mark.integration
 def test_worlds_are_not_copied_per_vehicle():
     worlds = terrain_map.stack([ground(hills())] * 8)
     env, params = bicycle_env(worlds, circle_tasks(worlds))

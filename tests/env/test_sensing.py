@@ -178,6 +178,7 @@ def test_heights_err_by_as_much_as_is_said_and_always_alike():
     assert all(abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.03 for a, b in pairs)
 
 
+@pytest.mark.integration
 def test_a_displaced_map_shows_the_ground_beside():
     env, params = erroneous("displaced")
     known, _ = bicycle_env(ground(hills()), TASK)

@@ -203,6 +203,7 @@ def test_a_kind_of_ground_that_nobody_drove_on_has_no_error(recorded):
         WindowData.of(replace(CONFIG, weights=(0.0, 1.0, 1.0)), (rigid, terrain), (rigid, terrain))
 
 
+@pytest.mark.integration
 def test_a_bicycle_learns_from_chrono(data, tmp_path):
     config = FitConfig(
         updates=150,

@@ -85,6 +85,7 @@ def test_a_vehicle_that_is_none_is_named():
         PipelineConfig(vehicle="rovr")
 
 
+@pytest.mark.integration
 def test_stages_from_nothing_are_of_their_vehicle(tmp_path, monkeypatch):
     """By the numbers of the vehicle, whose file may have changed."""
     told = {}

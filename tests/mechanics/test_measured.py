@@ -54,6 +54,7 @@ def described(config: VehicleConfig, **changes) -> dict:
     return {**facts, **changes}
 
 
+@pytest.mark.integration
 def test_engine_and_brakes_are_found_from_how_it_starts_and_stops():
     found = measured(described(WEAK, design={"drive": "awd"}), "it")
     # Accelerations are means over 0.3 s, in which the torque has begun to fall.
@@ -91,6 +92,7 @@ def test_a_data_sheet_counts_more_than_guesses():
     assert found.drive == "rear" and found.hull == (1.0, 0.4, 0.1, 0.6)
 
 
+@pytest.mark.integration
 def test_who_starts_with_half_the_grip_is_taken_for_driven_by_the_rear_wheels():
     assert measured(described(replace(HMMWV, drive="rear")), "it").drive == "rear"
     strong = measured(described(HMMWV), "it")

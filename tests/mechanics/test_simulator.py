@@ -357,6 +357,7 @@ def test_front_wheels_turn_as_their_steering_does(command, wheels):
     assert found == pytest.approx(expected, rel=2e-3)
 
 
+@pytest.mark.integration
 def test_a_locked_vehicle_pulls_with_the_wheels_that_have_grip():
     """On a slope, with ice below the rear wheels: one that is open spins there and slides back."""
     friction = np.tile(np.where(np.arange(64) < 32, 0.02, 0.8), (64, 1))

@@ -37,6 +37,7 @@ def there_and_back(simulator, terrain, steering):
     return jax.lax.scan(advance, begun, commands)
 
 
+@pytest.mark.integration
 def test_the_way_back_is_in_the_ruts_of_the_way_there():
     (_, last), (_, histories) = there_and_back(Simulator(ruts=True), level("mud"), 0.0)
     forth, back = slice(30, FORTH), slice(FORTH + 20, FORTH + 35)

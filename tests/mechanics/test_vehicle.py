@@ -83,6 +83,7 @@ def test_a_vehicle_is_found_by_name_or_by_file(tmp_path):
         vehicle.load(str(tmp_path / "yours.yaml"))
 
 
+@pytest.mark.integration
 def test_the_same_drive_at_four_times_the_size_takes_twice_as_long():
     """Over waves, with steering: the simulator at both sizes, with as many sub-steps altogether."""
     x, y = np.meshgrid(*[(np.arange(65) - 32.0) / 4] * 2)

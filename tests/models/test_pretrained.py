@@ -25,6 +25,7 @@ RECORDED = {"rigid": 0.0534, "deformable": 0.0918, "transition": 0.1121}
 """Position errors of Verti-WM after 16 steps, m."""
 
 
+@pytest.mark.integration
 @pytest.mark.smoke
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_it_predicts_as_it_always_did(windows, dtype):

@@ -41,6 +41,7 @@ def test_a_model_that_keeps_latents_drives_alike(name):
     np.testing.assert_allclose(found.vector, expected.vector, atol=1e-3)
 
 
+@pytest.mark.integration
 def test_a_model_moves_the_vehicle_that_it_was_saved_with(tmp_path):
     """Of any layout, whose leaves those of the HMMWV do not have."""
     driven = replace(load("rover"), drive="rear", locked="rear", wheel_radius=(0.05, 0.06)).vehicle

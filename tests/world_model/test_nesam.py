@@ -131,6 +131,7 @@ def test_step_adds_what_the_network_says_in_its_scale():
     np.testing.assert_allclose(one(found, 0).vector, expected.vector, atol=1e-5)
 
 
+@pytest.mark.integration
 def test_steps_along_a_drive_equal_the_whole_sequence():
     steps = WINDOW + 5
     drive, control = standing(1, steps), commands(steps)
