@@ -229,7 +229,7 @@ def test_what_cannot_be_fitted_is_named(run, folder, tmp_path, capsys):
     said = " ".join(capsys.readouterr().err.split())
     assert "expected nothing but gates where there are 2" in said
     message = refusal(door("fit"), "--data", tmp_path, "--runs", tmp_path / "runs")
-    assert "expected files of drives, or folders of them named rigid" in message
+    assert "expected files of drives on rigid or deformable or mixed ground" in message
     again = shutil.copytree(run, tmp_path / "again")
     config, params = files.load(again / "model")
     other = jax.tree.map(lambda x: x + 1, params)

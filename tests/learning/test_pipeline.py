@@ -76,7 +76,7 @@ def test_drives_are_of_the_kind_that_their_folder_is_named_after(tmp_path, monke
     monkeypatch.chdir(rigid)
     here = PipelineConfig(data=(Path(),))
     assert pipeline.folders(here, ["rigid"]) == [Path()]
-    with pytest.raises(DataError, match="folders of them named mixed, found neither"):
+    with pytest.raises(DataError, match="drives on mixed ground, or folders of them named so"):
         pipeline.folders(here, ["mixed"])
 
 

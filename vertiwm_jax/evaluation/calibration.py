@@ -27,6 +27,7 @@ from vertiwm_jax.figures import line, sheet, style
 from vertiwm_jax.learning import dataset
 from vertiwm_jax.learning.dataset import Collection, Drives, SplitConfig
 from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.learning.windows import way
 from vertiwm_jax.models import files
 from vertiwm_jax.models.registry import load_model, moves_any, moving
 from vertiwm_jax.state import STEP_SECONDS
@@ -139,9 +140,7 @@ class Signs:
             )
         gates, specialists = read.spread.sum(axis=1), read.disagreement.sum(axis=1)
         first = np.asarray(windows.state[:, windows.context, None, :3])
-        legs = np.diff(np.concatenate([first, states.position], axis=1), axis=1)
-        speed = np.abs(np.asarray(windows.control[:, windows.context :, 0]))
-        lag = np.abs(STEP_SECONDS * speed.sum(axis=1) - np.linalg.norm(legs, axis=-1).sum(axis=1))
+        lag = np.abs(windows.commanded_way - way(np.concatenate([first, states.position], axis=1)))
         signs = {"gates and lag": (gates, lag), "gates": (gates,)} if np.any(gates) else {}
         signs |= {"lag": (lag,), "specialists": (specialists,), "nothing": ()}
         shown = {name: np.reshape(each, (-1, len(error))).T for name, each in signs.items()}

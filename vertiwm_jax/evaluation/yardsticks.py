@@ -10,6 +10,7 @@ import numpy as np
 from vertiwm_jax.evaluation import prediction
 from vertiwm_jax.evaluation.prediction import Interval, TestWindows
 from vertiwm_jax.evaluation.tables import markdown
+from vertiwm_jax.learning import windows
 from vertiwm_jax.state import STEP_SECONDS, VehicleState
 
 SPEEDS = {
@@ -91,7 +92,7 @@ def rows(name: str, predicted: VehicleState, test: TestWindows, split: str) -> l
     last = {measure: error[:, -1] for measure, error in found.items()}
     position = last["position"]
     path = np.asarray(test.windows.state, float)[:, test.windows.context :, :3]
-    way = np.linalg.norm(np.diff(path, axis=1), axis=-1).sum(axis=1)
+    way = windows.way(path)
     made = []
     for vehicle, ground, speed_bin, of in groups(test):
         interval = prediction.bootstrap(position[of], test.drive[of])

@@ -194,9 +194,8 @@ def _moves(of: Windows) -> np.ndarray:
 
     One that is stuck tells what it hangs on, and not what it is.
     """
-    state, speed = np.asarray(of.state)[:, of.context :], np.asarray(of.control)[:, of.context :, 0]
-    way = np.linalg.norm(np.diff(state[..., :3], axis=1), axis=-1).sum(axis=1)
-    return way >= _STUCK * np.abs(speed).sum(axis=1) * STEP_SECONDS
+    way = windows.way(np.asarray(of.state)[:, of.context :, :3])
+    return way >= _STUCK * of.commanded_way
 
 
 def _estimated_delay(drives: Drives) -> float:

@@ -164,8 +164,8 @@ def folders(config: PipelineConfig, kinds: Sequence[Kind]) -> list[Path]:
         chosen += [folder / kind for kind in kinds if (folder / kind).is_dir()]
     if not chosen:
         raise DataError(
-            f"{', '.join(map(str, given))}: expected files of drives, or folders of "
-            f"them named {' or '.join(kinds)}, found neither"
+            f"{', '.join(map(str, given))}: expected files of drives on "
+            f"{' or '.join(kinds)} ground, or folders of them named so, found neither"
         )
     return chosen
 

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 
 from vertiwm_jax.learning.dataset import Array, Drives, WheelSignals
 from vertiwm_jax.learning.schema import DataError
+from vertiwm_jax.state import STEP_SECONDS
 from vertiwm_jax.terrain.map import TerrainMap
 
 GROUNDS = ("rigid", "deformable", "transition")
@@ -46,6 +47,17 @@ class Windows:
     ground: jax.Array
     context: int = struct.field(pytree_node=False)
     wheels: WheelSignals = WheelSignals()
+
+    @property
+    def commanded_way(self) -> np.ndarray:
+        """`[N]` m, how far the vehicle is told to drive, forwards or backwards, while predicted."""
+        speed = np.abs(np.asarray(self.control)[:, self.context :, 0])
+        return STEP_SECONDS * speed.sum(axis=1)
+
+
+def way(position: np.ndarray) -> np.ndarray:
+    """`[N, K + 1, 3]` positions to the `[N]` lengths, m, of the ways through them."""
+    return np.linalg.norm(np.diff(position, axis=1), axis=-1).sum(axis=1)
 
 
 def index(
